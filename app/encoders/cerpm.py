@@ -191,22 +191,14 @@ KEY_COLUMN = "key_hex"
 class MarkerProgram:
     """Program of one marker.
 
-    Parameters
-    ----------
-    message : CerpmMessage
-        The first one: its sequence is above all that the marker ever sent.
-    key : bytes
-        The marker's own, 16 bytes; not shown by `repr`.
-    radio : RadioSettings
-
     Raises
     ------
     InvalidParameter
         The key has another length.
     """
 
-    message: CerpmMessage
-    key: bytes = field(repr=False)
+    message: CerpmMessage  # the first one: its sequence is above all that the marker ever sent
+    key: bytes = field(repr=False)  # the marker's own, 16 bytes; not shown by `repr`
     radio: RadioSettings
 
     def __post_init__(self) -> None:

@@ -154,8 +154,8 @@ class Hyperparameters:
     # `wander_m`, `wander_length_m`: [m] of the vehicle's offset: standard deviation, and correlation length
     wander_m: float = 0.2  # source: drivers keep 0.18 m RMS (`simulation.radio.driving.Driver`)
     wander_length_m: float = 30.0  # source: 2.5 s (`Driver.wander_time_s`) at 45 km/h
-    # `drift`, `slow_m`: [m] of the receiver's slow error, which replaces the wander if not 0: growth [m/sqrt(m)], and
-    # size
+    # `drift`, `slow_m`: of the receiver's slow error, which replaces the wander if not 0: growth [m/sqrt(m)], and
+    # size [m]
     drift: float = 0.0
     slow_m: float = 3.0  # source: by hand, sensitivity 1.00, 1.00
     # `width_m`, `width_sd_m`, `width_length_m`: [m] of the lane's width: mean, standard deviation, correlation length

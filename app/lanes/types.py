@@ -40,30 +40,20 @@ UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, 
 class LaneMarkers:
     """Verified markers of one lane, one row for each position that a marker number has sent.
 
-    Parameters
-    ----------
-    number : array_like of int, shape (K,)
-    lon_deg, lat_deg : array_like, shape (K,)
-        WGS 84 / ITRF; a row that is not a position on Earth is left out and reported. [deg]
-    side : array_like of int, shape (K,)
-        `LaneSide` values.
-    sigma_m : array_like, shape (K,)
-        Standard deviation of the survey on each axis; 0.02 m where it is not known. [m]
-    speed_limit_km_h : array_like, shape (K,)
-        NaN where none is posted. [km/h]
-
     Raises
     ------
     InvalidParameter
         Lengths differ, or a side is not a `LaneSide`.
     """
 
-    number: Ints
+    number: Ints  # shape (K,)
+    # `lon_deg`, `lat_deg`: shape (K,): [deg] WGS 84 / ITRF; a row that is not a position on Earth is left out and
+    # reported
     lon_deg: Floats
     lat_deg: Floats
-    side: Ints
-    sigma_m: Floats
-    speed_limit_km_h: Floats
+    side: Ints  # shape (K,): `LaneSide` values
+    sigma_m: Floats  # shape (K,): [m] standard deviation of the survey on each axis; 0.02 m where it is not known
+    speed_limit_km_h: Floats  # shape (K,): [km/h] NaN where none is posted
 
     def __post_init__(self) -> None:
         lengths = set()

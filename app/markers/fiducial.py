@@ -88,13 +88,6 @@ def codewords(name: str) -> npt.NDArray[np.uint8]:
 class FiducialCode:
     """A codeword of a dictionary.
 
-    Parameters
-    ----------
-    dictionary : str
-        Name of the dictionary.
-    number : int
-        Of the codeword, from 0.
-
     Raises
     ------
     InvalidParameter
@@ -103,8 +96,8 @@ class FiducialCode:
         The dictionary has fewer codewords.
     """
 
-    dictionary: str
-    number: int
+    dictionary: str  # name of the dictionary
+    number: int  # of the codeword, from 0
 
     def __post_init__(self) -> None:
         size = get_dictionary(self.dictionary).size
@@ -158,22 +151,14 @@ class Mounting(StrEnum):
 class FiducialGeometry:
     """Dimensions and mounting of a sign.
 
-    Parameters
-    ----------
-    side_mm : float
-        Outer edge of the black border, 30 to 3000. [mm]
-    quiet_mm : float
-        Width of the white zone round the border, 0 to 1000. [mm]
-    mounting : Mounting
-
     Raises
     ------
     InvalidParameter
         A dimension is outside its limits.
     """
 
-    side_mm: float
-    quiet_mm: float
+    side_mm: float  # [mm] outer edge of the black border, 30 to 3000
+    quiet_mm: float  # [mm] width of the white zone round the border, 0 to 1000
     mounting: Mounting = Mounting.UPRIGHT
 
     def __post_init__(self) -> None:

@@ -141,17 +141,6 @@ class LineTag:
 class InformationTag:
     """A row of magnets along a lane that carries a code, {P, 0, M, L, Seg_d, r}.
 
-    Parameters
-    ----------
-    polarities : tuple of Polarity, length M
-        First magnet first, 2 to 7 of them. A string such as ``"SNS"`` is taken too.
-    length_m : float
-        L, from the first magnet to the last: a whole number of segments. [m]
-    segment_m : float
-        Seg_d, the grid on which the middle magnets stand. [m]
-    positions : tuple of int, length M - 2
-        Grid positions of the middle magnets, counted from the first magnet: rising, between 1 and L/Seg_d - 1.
-
     Raises
     ------
     InvalidParameter
@@ -162,9 +151,10 @@ class InformationTag:
     Neighbours nearer than 0.5 m are allowed here, as in the paper's equation 2; the checks of a layout refuse them.
     """
 
-    polarities: tuple[Polarity, ...]
-    length_m: float
-    segment_m: float
+    polarities: tuple[Polarity, ...]  # first magnet first, 2 to 7 of them. A string such as ``"SNS"`` is taken too.
+    length_m: float  # [m] L, from the first magnet to the last: a whole number of segments
+    segment_m: float  # [m] Seg_d, the grid on which the middle magnets stand
+    # grid positions of the middle magnets, counted from the first magnet: rising, between 1 and L/Seg_d - 1
     positions: tuple[int, ...]
 
     def __post_init__(self) -> None:

@@ -36,26 +36,16 @@ from app.markers.magnet import (
 class TagDesign:
     """What the tags of a family share: {M, L, Seg_d}, and how near neighbours may stand.
 
-    Parameters
-    ----------
-    magnets : int
-        M, 2 to 7.
-    length_m : float
-        L, a whole number of segments. [m]
-    segment_m : float
-        Seg_d. [m]
-    min_gap_m : float
-        Least distance between neighbours; 0.5 m keeps their fields apart, 0 gives the paper's ideal. [m]
-
     Raises
     ------
     InvalidParameter
         A value is outside the limits of a tag.
     """
 
-    magnets: int
-    length_m: float
-    segment_m: float
+    magnets: int  # m, 2 to 7
+    length_m: float  # [m] L, a whole number of segments
+    segment_m: float  # [m] Seg_d
+    # [m] least distance between neighbours; 0.5 m keeps their fields apart, 0 gives the paper's ideal
     min_gap_m: float = MIN_GAP_M
 
     def __post_init__(self) -> None:
@@ -480,13 +470,6 @@ _NUMBERS: dict[MeaningKind, tuple[str, float, float]] = {
 class Meaning:
     """A kind and its value.
 
-    Parameters
-    ----------
-    kind : MeaningKind
-    value : float or str
-        A number in the kind's unit (distance to the stop line [m], speed limit, angle of the bend [deg]), the `Arrow`,
-        or the text of a notice, 1 to 80 printable characters.
-
     Raises
     ------
     InvalidParameter
@@ -494,6 +477,8 @@ class Meaning:
     """
 
     kind: MeaningKind
+    # a number in the kind's unit (distance to the stop line [m], speed limit, angle of the bend [deg]), the `Arrow`, or
+    # the text of a notice, 1 to 80 printable characters
     value: float | str
 
     def __post_init__(self) -> None:
@@ -552,15 +537,6 @@ def check_name(field: str, text: Any) -> None:
 class Codebook:
     """The codes of one design and what they mean.
 
-    Parameters
-    ----------
-    name : str
-        1 to 80 printable characters.
-    design : TagDesign
-        What all its tags share.
-    entries : tuple of (InformationTag, Meaning)
-        In the order in which they were added.
-
     Raises
     ------
     InvalidParameter
@@ -569,9 +545,9 @@ class Codebook:
         A code or a meaning occurs twice.
     """
 
-    name: str
-    design: TagDesign
-    entries: tuple[tuple[InformationTag, Meaning], ...] = ()
+    name: str  # 1 to 80 printable characters
+    design: TagDesign  # what all its tags share
+    entries: tuple[tuple[InformationTag, Meaning], ...] = ()  # in the order in which they were added
 
     def __post_init__(self) -> None:
         check_name("name", self.name)

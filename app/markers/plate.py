@@ -156,27 +156,16 @@ class PlateScheme(StrEnum):
 class PlateGeometry:
     """Dimensions of a plate.
 
-    Parameters
-    ----------
-    n : int
-        Units along a side: 8, 10 or 12.
-    unit_mm : float
-        Side of a unit, 20 to 50. [mm]
-    gap_mm : float
-        Insulation between units and round the border, 2 to 10. [mm]
-    thickness_mm : float
-        Thickness of the base plate, 5 to 50. [mm]
-
     Raises
     ------
     InvalidParameter
         A dimension, or the side that follows from them (150 to 500 mm), is outside the paper's limits.
     """
 
-    n: int = 8
-    unit_mm: float = 35.0
-    gap_mm: float = 5.0
-    thickness_mm: float = 20.0
+    n: int = 8  # units along a side: 8, 10 or 12
+    unit_mm: float = 35.0  # [mm] side of a unit, 20 to 50
+    gap_mm: float = 5.0  # [mm] Insulation between units and round the border, 2 to 10
+    thickness_mm: float = 20.0  # [mm] Thickness of the base plate, 5 to 50
 
     def __post_init__(self) -> None:
         if self.n not in SIZES:
@@ -351,26 +340,17 @@ def plate_capacity(n: int, scheme: PlateScheme, check_digits: int = 1) -> PlateC
 class PlateCode:
     """The symbols of one plate, checked against their scheme.
 
-    Parameters
-    ----------
-    digits : str
-        One hexadecimal digit a cell in reading order; decimal for the schemes ``position`` and ``position-check``.
-    scheme : PlateScheme
-    n : int
-        Units along a side.
-    check_digits : int
-        For ``position-check``: 1 or 2 digits of the sum of the others.
-
     Raises
     ------
     CodeMismatch
         Wrong length, alphabet or check.
     """
 
+    # one hexadecimal digit a cell in reading order; decimal for the schemes ``position`` and ``position-check``
     digits: str
     scheme: PlateScheme = PlateScheme.POSITION
-    n: int = 8
-    check_digits: int = 1
+    n: int = 8  # units along a side
+    check_digits: int = 1  # for ``position-check``: 1 or 2 digits of the sum of the others
 
     def __post_init__(self) -> None:
         _layout(self.n, self.scheme, 1)

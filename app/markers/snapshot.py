@@ -141,21 +141,14 @@ def key_id_of(public_key: bytes) -> bytes:
 class Trust:
     """What a reader verifies snapshots with. The operator installs it over a trusted channel.
 
-    Parameters
-    ----------
-    agency_id : str
-        UUID of the agency whose snapshots are accepted.
-    public_keys : tuple of bytes
-        One or two Ed25519 public keys, 32 bytes each.
-
     Raises
     ------
     InvalidParameter
         The agency is not a UUID, or the keys are none, more than two, equal or of another length.
     """
 
-    agency_id: str
-    public_keys: tuple[bytes, ...]
+    agency_id: str  # UUID of the agency whose snapshots are accepted
+    public_keys: tuple[bytes, ...]  # one or two Ed25519 public keys, 32 bytes each
 
     def __post_init__(self) -> None:
         """Check the values."""

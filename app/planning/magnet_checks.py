@@ -73,21 +73,13 @@ _TOLERANCE_M = 0.0005  # [m] rounding of positions; source: by hand
 
 @dataclass(frozen=True, slots=True)
 class Neighbour:
-    """Another marker near by.
-
-    Parameters
-    ----------
-    name : str
-    lon_deg, lat_deg : float
-        [deg]
-    orientation : Orientation
-        Of its magnet; what is no magnet counts as lying.
-    """
+    """Another marker near by."""
 
     name: str
+    # `lon_deg`, `lat_deg`: [deg]
     lon_deg: float
     lat_deg: float
-    orientation: Orientation = Orientation.FORWARD
+    orientation: Orientation = Orientation.FORWARD  # of its magnet; what is no magnet counts as lying
 
     def __post_init__(self) -> None:
         check_name("neighbours.name", self.name)
@@ -98,21 +90,6 @@ class Neighbour:
 class Site:
     """What the checks need to know of the road and its traffic.
 
-    Parameters
-    ----------
-    design_speed_mps : float, optional
-        [m/s]
-    stop_line_chainage_m : float, optional
-        Of the stop line that the tag announces, on the same line; needs the design speed. [m]
-    vehicles : tuple of str
-        Kinds of vehicle to be served, of `vehicle_clearances`.
-    readable_clearance_m : float
-        Up to which clearance the decoder reads. [m]
-    neighbours : tuple of Neighbour
-        Markers near by: of other lanes, of lines, of other tags.
-    reaction_s, deceleration_mps2 : float
-        Of the driver or the system that acts on the tag. [s], [m/s2]
-
     Raises
     ------
     InvalidParameter
@@ -120,10 +97,12 @@ class Site:
     """
 
     design_speed_mps: float | None = None
+    # [m] of the stop line that the tag announces, on the same line; needs the design speed
     stop_line_chainage_m: float | None = None
-    vehicles: tuple[str, ...] = ("sedan", "utility")
-    readable_clearance_m: float = READABLE_CLEARANCE_M
-    neighbours: tuple[Neighbour, ...] = field(default=())
+    vehicles: tuple[str, ...] = ("sedan", "utility")  # kinds of vehicle to be served, of `vehicle_clearances`
+    readable_clearance_m: float = READABLE_CLEARANCE_M  # [m] up to which clearance the decoder reads
+    neighbours: tuple[Neighbour, ...] = field(default=())  # markers near by: of other lanes, of lines, of other tags
+    # `reaction_s`, `deceleration_mps2`: of the driver or the system that acts on the tag
     reaction_s: float = REACTION_S
     deceleration_mps2: float = DECELERATION_MPS2
 

@@ -49,20 +49,15 @@ _STATION_STEP_M = 5.0  # [m] source: by hand, no measurement kept
 class PreviewRule:
     """Distance ahead at which a marker must have been read.
 
-    Parameters
-    ----------
-    distance_m : float, optional
-        Fixed, 1 to 2,000. By default it is the distance in which the vehicle stops, and at least the camera's 31 m. [m]
-    reaction_s, deceleration_mps2 : float
-        Of the driver or the system; AASHTO Green Book (2018), section 3.2.2, by default. [s], [m/s2]
-
     Raises
     ------
     InvalidParameter
         A value is outside its limits.
     """
 
+    # [m] fixed, 1 to 2,000. By default it is the distance in which the vehicle stops, and at least the camera's 31 m.
     distance_m: float | None = None
+    # `reaction_s`, `deceleration_mps2`: of the driver or the system; by default AASHTO Green Book (2018), 3.2.2
     reaction_s: float = REACTION_S
     deceleration_mps2: float = DECELERATION_MPS2
 
@@ -83,26 +78,6 @@ class PreviewRule:
 class RadioPlan:
     """Markers along a road, their radios, and the requirements.
 
-    Parameters
-    ----------
-    settings : RadioSettings
-    region : Region
-    spacing_m, sides, lane_width_m
-        Of a long road with markers at even distances on one or two sides; used without `markers`.
-        1 to 1,000 m; 1 or 2; 1 to 20 m.
-    markers : RoadMarkers, optional
-        Their positions.
-    design_speed_mps : float
-        0.5 to 70. [m/s]
-    preview : PreviewRule
-    link : LinkModel
-    receiver : Receiver
-    battery : Battery
-    min_probability : float
-        That a marker is read before the preview distance, 0.5 to 0.9999.
-    min_battery_days : float
-        0 to 36,500. [day]
-
     Raises
     ------
     InvalidParameter
@@ -111,17 +86,19 @@ class RadioPlan:
 
     settings: RadioSettings
     region: Region = Region.US915
+    # `spacing_m`, `sides`, `lane_width_m`: of a long road with markers at even distances on one or two sides; used
+    # without `markers`. 1 to 1,000 m; 1 or 2; 1 to 20 m.
     spacing_m: float = SPACING_M
     sides: int = 2
     lane_width_m: float = LANE_WIDTH_M
-    markers: RoadMarkers | None = None
-    design_speed_mps: float = 13.4
+    markers: RoadMarkers | None = None  # their positions
+    design_speed_mps: float = 13.4  # [m/s] 0.5 to 70
     preview: PreviewRule = field(default_factory=PreviewRule)
     link: LinkModel = field(default_factory=LinkModel)
     receiver: Receiver = field(default_factory=Receiver)
     battery: Battery = field(default_factory=Battery)
-    min_probability: float = 0.99
-    min_battery_days: float = 365.0
+    min_probability: float = 0.99  # that a marker is read before the preview distance, 0.5 to 0.9999
+    min_battery_days: float = 365.0  # [day] 0 to 36,500
 
     def __post_init__(self) -> None:
         check_between("design_speed_mps", self.design_speed_mps, 0.5, 70.0, "m/s")

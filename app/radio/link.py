@@ -45,17 +45,6 @@ def sensitivity_dbm(spreading_factor: int, bandwidth_hz: int) -> float:
 class LinkModel:
     """Path loss over the logarithm of distance.
 
-    Parameters
-    ----------
-    near_m, near_dbm : float
-        A distance and the mean level there. [m], [dBm]
-    exponent : float
-        1 to 6.
-    at_power_dbm : float
-        The power that was sent then. [dBm]
-    fading_db : float
-        Standard deviation of a packet's level about the mean, 0 to 15; each packet fades by itself. [dB]
-
     Raises
     ------
     InvalidParameter
@@ -66,10 +55,12 @@ class LinkModel:
     By default the line through the CERPM paper's two points, with a fading of 4 dB, which the paper does not give.
     """
 
+    # `near_m`, `near_dbm`: a distance and the mean level there
     near_m: float = NEAR_M
     near_dbm: float = NEAR_DBM
-    exponent: float = EXPONENT
-    at_power_dbm: float = PAPER_POWER_DBM
+    exponent: float = EXPONENT  # 1 to 6
+    at_power_dbm: float = PAPER_POWER_DBM  # [dBm] the power that was sent then
+    # [dB] standard deviation of a packet's level about the mean, 0 to 15; each packet fades by itself
     fading_db: float = FADING_DB
 
     def __post_init__(self) -> None:

@@ -28,27 +28,16 @@ _BIN = 0.02  # standard deviations of fading between the levels of `_binned`; so
 class Receiver:
     """The receiver in the vehicle.
 
-    Parameters
-    ----------
-    channels : int
-        That it receives at the same time; 1 for an SX1276, 8 for a gateway's chip.
-    sensitivity_dbm : float, optional
-        -150 to -60; the SX1276's by default. [dBm]
-    capture_db : float, optional
-        0 to 30; None where every overlap loses both packets. [dB]
-    relocks : bool
-        Whether it abandons a weak packet for a stronger one that begins later. An SX1276 does not.
-
     Raises
     ------
     InvalidParameter
         A value is outside its limits.
     """
 
-    channels: int = 1
-    sensitivity_dbm: float | None = None
-    capture_db: float | None = CAPTURE_DB
-    relocks: bool = False
+    channels: int = 1  # that it receives at the same time; 1 for an SX1276, 8 for a gateway's chip
+    sensitivity_dbm: float | None = None  # [dBm] -150 to -60; the SX1276's by default
+    capture_db: float | None = CAPTURE_DB  # [dB] 0 to 30; None where every overlap loses both packets
+    relocks: bool = False  # whether it abandons a weak packet for a stronger one that begins later. An SX1276 does not.
 
     def __post_init__(self) -> None:
         check_whole("receiver.channels", self.channels, 1, MAX_CHANNELS, "")
@@ -227,21 +216,14 @@ _PHASES = 32  # of the transmissions on the approach; source: by hand, no measur
 class RoadMarkers:
     """Positions of markers along a road.
 
-    Parameters
-    ----------
-    chainage_m : array_like, shape (M,)
-        Along the road, rising in the direction of travel; in any order. [m]
-    offset_m : array_like, shape (M,)
-        From the receiver's path, left positive, within 100 m. [m]
-
     Raises
     ------
     InvalidParameter
         Lengths differ, a value is not finite, or there are none or more than 20,000.
     """
 
-    chainage_m: Floats
-    offset_m: Floats
+    chainage_m: Floats  # shape (M,): [m] along the road, rising in the direction of travel; in any order
+    offset_m: Floats  # shape (M,): [m] from the receiver's path, left positive, within 100 m
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -329,7 +311,7 @@ class StationReception:
 
     station_m: float
     index: npt.NDArray[np.intp]  # shape (H,): index of each marker
-    # `distance_m`, `level_dbm`: shape (H,): [dBm] [m],
+    # `distance_m`, `level_dbm`: shape (H,)
     distance_m: Floats
     level_dbm: Floats
     success: Floats  # shape (H,): share of each marker's packets that are read

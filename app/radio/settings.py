@@ -177,52 +177,31 @@ CHANNEL_STEP = 1.6  # bandwidths between channels; source: LoRaWAN Regional Para
 class RadioSettings:
     """Settings of the radio of a marker.
 
-    Parameters
-    ----------
-    frequency_hz : int
-        Carrier of the lowest channel, 779 to 1,020 MHz. [Hz]
-    spreading_factor : int
-        7 to 12, or 6 without a header.
-    bandwidth_hz : int
-        125,000, 250,000 or 500,000. [Hz]
-    interval_s : float
-        From one transmission to the next on average, 0.05 to 86,400. [s]
-    jitter_share : float
-        Each interval is drawn evenly from interval (1 - share) to interval (1 + share), 0 to 0.9: without it two
-        markers that collide once collide every time.
-    power_dbm : float
-        At the antenna's connector, -4 to 20; above 17 the transmitter may send 1 % of the time. [dBm]
-    antenna_gain_dbi : float
-        -10 to 6. [dBi]
-    channels : int
-        Number of channels that packets are spread over, 1 to 128, in steps of 1.6 bandwidths as in LoRaWAN.
-    hopping : bool
-        Every marker uses all channels in a pseudo-random order; otherwise each uses one of them.
-    coding_rate, preamble_symbols, explicit_header, crc
-        See `time_on_air_s`.
-    lorawan : bool
-        The message travels in a LoRaWAN frame.
-
     Raises
     ------
     InvalidParameter
         A value is outside its limits, or a packet is longer than the shortest interval.
     """
 
-    frequency_hz: int = 915_000_000
-    spreading_factor: int = 7
-    bandwidth_hz: int = 500_000
-    interval_s: float = 1.6
+    frequency_hz: int = 915_000_000  # [Hz] Carrier of the lowest channel, 779 to 1,020 MHz
+    spreading_factor: int = 7  # 7 to 12, or 6 without a header
+    bandwidth_hz: int = 500_000  # [Hz] 125,000, 250,000 or 500,000
+    interval_s: float = 1.6  # [s] from one transmission to the next on average, 0.05 to 86,400
+    # each interval is drawn evenly from interval (1 - share) to interval (1 + share), 0 to 0.9: without it two markers
+    # that collide once collide every time
     jitter_share: float = 0.2
+    # [dBm] at the antenna's connector, -4 to 20; above 17 the transmitter may send 1 % of the time
     power_dbm: float = 20.0
-    antenna_gain_dbi: float = 2.15
+    antenna_gain_dbi: float = 2.15  # [dBi] -10 to 6
+    # number of channels that packets are spread over, 1 to 128, in steps of 1.6 bandwidths as in LoRaWAN
     channels: int = 1
-    hopping: bool = False
+    hopping: bool = False  # every marker uses all channels in a pseudo-random order; otherwise each uses one of them
+    # `coding_rate`, `preamble_symbols`, `explicit_header`, `crc`: see `time_on_air_s`
     coding_rate: int = 5
     preamble_symbols: int = 8
     explicit_header: bool = True
     crc: bool = True
-    lorawan: bool = False
+    lorawan: bool = False  # the message travels in a LoRaWAN frame
 
     def __post_init__(self) -> None:
         check_modulation(self.spreading_factor, self.bandwidth_hz, explicit_header=self.explicit_header)
@@ -295,31 +274,23 @@ _TRANSMIT_MA = ((7.0, 20.0), (13.0, 29.0), (17.0, 87.0), (20.0, 120.0))  # [dBm,
 class Battery:
     """A marker's battery and its loads.
 
-    Parameters
-    ----------
-    capacity_mah : float
-        10 to 1,000,000. [mAh]
-    usable_share : float
-        Share left by cold, age and self-discharge, 0.1 to 1.
-    sleep_ma : float
-        Whole marker between packets, 0 to 1,000. The default is the maker's figure for the paper's board (WiFi LoRa 32,
-        deep sleep); a purpose-built board needs a hundredth. [mA]
-    awake_ma, awake_s : float
-        Its processor while it makes a packet, and the time for that besides the time on air: assumed. [mA], [s]
-    transmit_ma : float, optional
-        Radio while it sends, 1 to 1,000; by the SX1276's data sheet from the power by default. [mA]
-
     Raises
     ------
     InvalidParameter
         A value is outside its limits.
     """
 
-    capacity_mah: float = CAPACITY_MAH
+    capacity_mah: float = CAPACITY_MAH  # [mAh] 10 to 1,000,000
+    # share left by cold, age and self-discharge, 0.1 to 1
     usable_share: float = 0.8  # source: assumed, no measurement kept
+    # [mA] whole marker between packets, 0 to 1,000. The default is the maker's figure for the paper's board (WiFi LoRa
+    # 32, deep sleep); a purpose-built board needs a hundredth.
     sleep_ma: float = 0.8  # [mA] source: the maker's figure for the WiFi LoRa 32, deep sleep
+    # `awake_ma`, `awake_s`: [s] its processor while it makes a packet, and the time for that besides the time on air:
+    # assumed. [mA],
     awake_ma: float = 40.0  # [mA] source: assumed, no measurement kept
     awake_s: float = 0.01  # [s] source: assumed, no measurement kept
+    # [mA] radio while it sends, 1 to 1,000; by the SX1276's data sheet from the power by default
     transmit_ma: float | None = None
 
     def __post_init__(self) -> None:

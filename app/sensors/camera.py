@@ -15,43 +15,26 @@ from app.errors import InvalidParameter
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Intrinsics and mount of a camera.
+    """Intrinsics and mount of a camera."""
 
-    Parameters
-    ----------
-    width_px, height_px : int
-        Image size. [px]
-    fx_px, fy_px, cx_px, cy_px : float
-        Focal lengths and principal point; pixel centres at integers. [px]
-    distortion : tuple of float
-        OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for none.
-    height_m : float
-        Above the road. [m]
-    depression_deg : float
-        Optical axis below the horizontal. [deg]
-    azimuth_deg : float
-        Optical axis clockwise (to the right) from straight ahead. [deg]
-    roll_deg : float
-        Clockwise about the optical axis, seen from behind the camera. [deg]
-    forward_m, left_m : float
-        Optical centre in the vehicle frame (ISO 8855) from the vehicle's reference point on the road. [m]
-    readout_s : float
-        Rolling shutter: time from the first row's exposure to the last's; 0 is a global shutter. [s]
-    """
-
+    # `width_px`, `height_px`: [px] image size
     width_px: int
     height_px: int
+    # `fx_px`, `fy_px`, `cx_px`, `cy_px`: [px] focal lengths and principal point; pixel centres at integers
     fx_px: float
     fy_px: float
     cx_px: float
     cy_px: float
-    distortion: tuple[float, ...] = ()
-    height_m: float = 1.57
-    depression_deg: float = 23.0
-    azimuth_deg: float = 0.0
-    roll_deg: float = 0.0
+    distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for none
+    height_m: float = 1.57  # [m] above the road
+    depression_deg: float = 23.0  # [deg] optical axis below the horizontal
+    azimuth_deg: float = 0.0  # [deg] optical axis clockwise (to the right) from straight ahead
+    roll_deg: float = 0.0  # [deg] clockwise about the optical axis, seen from behind the camera
+    # `forward_m`, `left_m`: [m] optical centre in the vehicle frame (ISO 8855) from the vehicle's reference point on
+    # the road
     forward_m: float = 0.0
     left_m: float = 0.0
+    # [s] rolling shutter: time from the first row's exposure to the last's; 0 is a global shutter
     readout_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -139,22 +122,18 @@ _MARKERS = 100
 class CalibrationBoard:
     """A board, seen from the front. Board frame: millimetres from its upper left corner, x right, y down.
 
-    Parameters
-    ----------
-    columns, rows : int
-        Squares, 4 to 24 each, at most 200 together: half of them hold a marker. The upper left one is black.
-    square_mm, marker_mm : float
-        Side of a square, 8 to 250 mm, and of a marker, 0.5 to 0.85 of that. As measured on the print; intrinsics do
-        not depend on the scale. [mm]
-
     Raises
     ------
     InvalidParameter
         A figure is out of its limits.
     """
 
+    # `columns`, `rows`: squares, 4 to 24 each, at most 200 together: half of them hold a marker. The upper left one is
+    # black.
     columns: int = 7
     rows: int = 10
+    # `square_mm`, `marker_mm`: [mm] side of a square, 8 to 250 mm, and of a marker, 0.5 to 0.85 of that. As measured on
+    # the print; intrinsics do not depend on the scale.
     square_mm: float = 25.0
     marker_mm: float = 18.0
 

@@ -38,32 +38,23 @@ class SensorRole(StrEnum):
 class MagnetometerBar:
     """Where the magnetometers of a vehicle sit and how they are turned.
 
-    Parameters
-    ----------
-    positions_m : array_like, shape (S, 3)
-        In the vehicle frame (ISO 8855: x forward, y left, z up). The origin is the point that moves along the heading
-        (the middle of the rear axle; the bar itself if it is not known). Only differences of z count. [m]
-    roles : tuple of SensorRole, length S
-        Array sensors look for magnets, reference sensors listen to the wheels: each is nearer to its wheel than any
-        array sensor.
-    vehicle_from_sensor : ndarray, shape (S, 3, 3)
-        Rotation of each chip; the identity if left out.
-    axis_delay_s : tuple of float
-        Times after the time stamp at which x, y and z are converted. [s]
-    clearance_m : float, optional
-        Of the middle of the array sensors above the road, if it is known. [m]
-
     Raises
     ------
     InvalidParameter
         Fewer than three array sensors or two in one place, positions that are not finite, or lengths that differ.
     """
 
+    # shape (S, 3): [m] in the vehicle frame (ISO 8855: x forward, y left, z up). The origin is the point that moves
+    # along the heading (the middle of the rear axle; the bar itself if it is not known). Only differences of z count.
     positions_m: Floats
+    # array sensors look for magnets, reference sensors listen to the wheels: each is nearer to its wheel than any array
+    # sensor
     roles: tuple[SensorRole, ...]
+    # shape (S, 3, 3): rotation of each chip; the identity if left out
     vehicle_from_sensor: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
+    # [s] times after the time stamp at which x, y and z are converted
     axis_delay_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    clearance_m: float | None = None
+    clearance_m: float | None = None  # [m] of the middle of the array sensors above the road, if it is known
 
     def __post_init__(self) -> None:
         positions = np.array(self.positions_m, float)
@@ -155,27 +146,18 @@ class MagnetometerBar:
 class MagnetTrace:
     """What a bar and its vehicle recorded, whole or a piece of it.
 
-    Parameters
-    ----------
-    t_s : ndarray, shape (T,)
-        Monotonic time of each sample. [s]
-    field_ut : ndarray, shape (T, S, 3)
-        In vehicle axes (ISO 8855); NaN where nothing was read. [uT]
-    speed_t_s, speed_m_s : ndarray, shape (V,)
-        Speed over ground and its times. [s, m/s]
-    heading_t_s, heading_deg : ndarray, shape (H,), or None
-        Heading, clockwise from north, and its times. [s, deg]
-
     Raises
     ------
     InvalidParameter
         Shapes that do not fit, time that stands still or runs backwards, speeds or headings that are not finite.
     """
 
-    t_s: Floats
-    field_ut: npt.NDArray[np.floating]
+    t_s: Floats  # shape (T,): [s] Monotonic time of each sample
+    field_ut: npt.NDArray[np.floating]  # shape (T, S, 3): [uT] in vehicle axes (ISO 8855); NaN where nothing was read
+    # `speed_t_s`, `speed_m_s`: shape (V,): speed over ground and its times. [s, m/s]
     speed_t_s: Floats
     speed_m_s: Floats
+    # `heading_t_s`, `heading_deg`: shape (H,), or None: heading, clockwise from north, and its times. [s, deg]
     heading_t_s: Floats | None = None
     heading_deg: Floats | None = None
 

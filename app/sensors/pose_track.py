@@ -25,28 +25,18 @@ MAX_SPEED_M_S = 70.0  # [m/s] a faster step is a gap in the track; source: by ha
 class PoseTrack:
     """A vehicle's own positions over time.
 
-    Parameters
-    ----------
-    time_s : array_like, shape (T,)
-        Seconds since 1970-01-01 UTC, rising. [s]
-    lon_deg, lat_deg : array_like, shape (T,)
-        WGS 84 / ITRF. [deg]
-    heading_deg : array_like, shape (T,)
-        Clockwise from true north; NaN where it is not known. [deg]
-    accuracy_m : array_like, shape (T,)
-        Horizontal standard deviation of a position; NaN where it is not known. [m]
-
     Raises
     ------
     InvalidParameter
         Lengths differ, times do not rise, or a position is not finite.
     """
 
-    time_s: Floats
+    time_s: Floats  # shape (T,): [s] seconds since 1970-01-01 UTC, rising
+    # `lon_deg`, `lat_deg`: shape (T,): [deg] WGS 84 / ITRF
     lon_deg: Floats
     lat_deg: Floats
-    heading_deg: Floats
-    accuracy_m: Floats
+    heading_deg: Floats  # shape (T,): [deg] clockwise from true north; NaN where it is not known
+    accuracy_m: Floats  # shape (T,): [m] horizontal standard deviation of a position; NaN where it is not known
 
     def __post_init__(self) -> None:
         arrays = {name: np.asarray(getattr(self, name), float) for name in self.__slots__}

@@ -15,18 +15,7 @@ from app.simulation.plate_scene import Air, PlacedFace, PlateScene, Sensor, Shad
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """All of a scene but the plate's code and place.
-
-    Parameters
-    ----------
-    look, wear : PlateLook, PlateWear
-    shadow, air, sensor : Shadow, Air, Sensor
-    exposure_s : float
-        [s]
-    road_reflectance : float
-    night_light : float or None
-        As in PlateScene.
-    """
+    """All of a scene but the plate's code and place."""
 
     look: PlateLook
     wear: PlateWear
@@ -35,7 +24,7 @@ class Conditions:
     sensor: Sensor
     exposure_s: float
     road_reflectance: float
-    night_light: float | None = None
+    night_light: float | None = None  # as in PlateScene
 
 
 def draw_daylight(rng: np.random.Generator) -> Conditions:
@@ -148,33 +137,18 @@ def _uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A pass over a square on the road at even speed.
-
-    Parameters
-    ----------
-    camera : Camera
-    face : Face
-    speed_m_s, fps, exposure_s : float
-        Speed, frames a second, exposure time.
-    left_m : float
-        Plate's centre left of the camera's path. [m]
-    rotation_deg : float
-        Of the plate, clockwise from the vehicle's heading. [deg]
-    far_m : float
-        Distance ahead at which the first frames are taken. [m]
-    sway_deg : float
-        Standard deviation of roll and pitch between frames, as springs give it. [deg]
-    """
+    """A pass over a square on the road at even speed."""
 
     camera: Camera
     face: Face
+    # `speed_m_s`, `fps`, `exposure_s`: speed, frames a second, exposure time
     speed_m_s: float
     fps: float
     exposure_s: float
-    left_m: float = 0.0
-    rotation_deg: float = 0.0
-    far_m: float = 12.0
-    sway_deg: float = 0.15
+    left_m: float = 0.0  # [m] plate's centre left of the camera's path
+    rotation_deg: float = 0.0  # [deg] of the plate, clockwise from the vehicle's heading
+    far_m: float = 12.0  # [m] distance ahead at which the first frames are taken
+    sway_deg: float = 0.15  # [deg] standard deviation of roll and pitch between frames, as springs give it
     road_reflectance: float = 0.22
     shadow: Shadow = field(default_factory=Shadow)
     air: Air = field(default_factory=Air)

@@ -22,59 +22,32 @@ _MAX_TEXELS = 800
 
 @dataclass(frozen=True, slots=True)
 class PlateLook:
-    """Materials of a plate.
+    """Materials of a plate."""
 
-    Parameters
-    ----------
-    dark, light, gap, red, green : tuple of float
-        Diffuse reflectance in blue, green, red, 0 to 1.
-    triangle_rest : tuple of float
-        Reflectance of the half of the red marker's cell that the triangle leaves free.
-    led : float
-        Radiance of a lit light unit, as a share of the sensor's saturation at gain 1; 0 is off.
-    led_markers : bool
-        The boundary markers are lit too, in their colours.
-    """
-
+    # `dark`, `light`, `gap`, `red`, `green`: Diffuse reflectance in blue, green, red, 0 to 1
     dark: Colour = (0.04, 0.04, 0.04)
     light: Colour = (0.75, 0.75, 0.75)
     gap: Colour = (0.1, 0.1, 0.1)
     red: Colour = (0.05, 0.05, 0.5)
     green: Colour = (0.12, 0.36, 0.06)
+    # reflectance of the half of the red marker's cell that the triangle leaves free
     triangle_rest: Colour = (0.75, 0.75, 0.75)
-    led: float = 0.0
-    led_markers: bool = True
+    led: float = 0.0  # radiance of a lit light unit, as a share of the sensor's saturation at gain 1; 0 is off
+    led_markers: bool = True  # the boundary markers are lit too, in their colours
 
 
 @dataclass(frozen=True, slots=True)
 class PlateWear:
-    """Wear of a plate. All shares are 0 (new) to 1.
+    """Wear of a plate. All shares are 0 (new) to 1."""
 
-    Parameters
-    ----------
-    contrast_loss : float
-        Even loss: every material moves this far towards the plate's mean.
-    patchy_loss : float
-        Most that patches of worn surface move towards the colour of dust.
-    patch_mm : float
-        Typical size of a patch. [mm]
-    dirt_blobs : int
-        Number of opaque stains.
-    dirt_mm : float
-        Typical radius of a stain. [mm]
-    paint_spots : int
-        Number of spots of paint: ellipses as dark as the dark units, as light as the light ones, or grey.
-    paint_mm : tuple of float
-        Least and greatest half axis of a spot. [mm]
-    """
-
-    contrast_loss: float = 0.0
-    patchy_loss: float = 0.0
-    patch_mm: float = 60.0
-    dirt_blobs: int = 0
-    dirt_mm: float = 20.0
+    contrast_loss: float = 0.0  # even loss: every material moves this far towards the plate's mean
+    patchy_loss: float = 0.0  # most that patches of worn surface move towards the colour of dust
+    patch_mm: float = 60.0  # [mm] Typical size of a patch
+    dirt_blobs: int = 0  # number of opaque stains
+    dirt_mm: float = 20.0  # [mm] Typical radius of a stain
+    # number of spots of paint: ellipses as dark as the dark units, as light as the light ones, or grey
     paint_spots: int = 0
-    paint_mm: tuple[float, float] = (8.0, 30.0)
+    paint_mm: tuple[float, float] = (8.0, 30.0)  # [mm] least and greatest half axis of a spot
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,21 +20,13 @@ Matrix = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PlacedFace:
-    """A square lying on the road.
-
-    Parameters
-    ----------
-    face : Face
-    ahead_m, left_m : float
-        Its centre in the ground frame. [m]
-    rotation_deg : float
-        Clockwise, seen from above, from the vehicle's heading to the face's up direction. [deg]
-    """
+    """A square lying on the road."""
 
     face: Face
+    # `ahead_m`, `left_m`: [m] its centre in the ground frame
     ahead_m: float
     left_m: float = 0.0
-    rotation_deg: float = 0.0
+    rotation_deg: float = 0.0  # [deg] clockwise, seen from above, from the vehicle's heading to the face's up direction
 
     @property
     def ground_from_face(self) -> Matrix:
@@ -62,31 +54,19 @@ class PlacedFace:
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """Shadows on road and plate, fixed to the first face's centre.
+    """Shadows on road and plate, fixed to the first face's centre."""
 
-    Parameters
-    ----------
-    edge_light : float
-        Share of light behind a straight shadow edge; 1 is no edge.
-    edge_angle_deg, edge_offset_m, penumbra_m : float
-        Direction of the edge's normal from ahead [deg], its distance from the face's centre, half width of its
-        soft border. [m]
-    dapple_light : float
-        Share of light in the darkest spot below leaves; 1 is none.
-    dapple_m, dapple_softness : float
-        Size of the spots [m], and how gradual they are, 0.02 to 0.5.
-    seed : int
-        Of the spots' places.
-    """
-
-    edge_light: float = 1.0
+    edge_light: float = 1.0  # share of light behind a straight shadow edge; 1 is no edge
+    # `edge_angle_deg`, `edge_offset_m`, `penumbra_m`: direction of the edge's normal from ahead, its distance from the
+    # face's centre, half width of its soft border
     edge_angle_deg: float = 0.0
     edge_offset_m: float = 0.0
     penumbra_m: float = 0.02
-    dapple_light: float = 1.0
+    dapple_light: float = 1.0  # share of light in the darkest spot below leaves; 1 is none
+    # `dapple_m`, `dapple_softness`: size of the spots [m], and how gradual they are, 0.02 to 0.5
     dapple_m: float = 0.15
     dapple_softness: float = 0.15
-    seed: int = 0
+    seed: int = 0  # of the spots' places
 
     @property
     def is_none(self) -> bool:
@@ -96,122 +76,62 @@ class Shadow:
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """Between road and lens.
+    """Between road and lens."""
 
-    Parameters
-    ----------
-    haze : float
-        Share of the light replaced by airlight, 0 to 1.
-    airlight : float
-        Radiance of the haze, as a share of saturation.
-    glare : float
-        Radiance of the mirrored sky or sun on the first face at the lobe's centre, as a share of saturation.
-    glare_at_m, glare_size_m : tuple of float
-        Centre (right, up from the face's centre) and radii (across, along) of the lobe. [m]
-    """
-
-    haze: float = 0.0
-    airlight: float = 0.7
+    haze: float = 0.0  # share of the light replaced by airlight, 0 to 1
+    airlight: float = 0.7  # radiance of the haze, as a share of saturation
+    # radiance of the mirrored sky or sun on the first face at the lobe's centre, as a share of saturation
     glare: float = 0.0
+    # `glare_at_m`, `glare_size_m`: [m] centre (right, up from the face's centre) and radii (across, along) of the lobe
     glare_at_m: tuple[float, float] = (0.0, 0.0)
     glare_size_m: tuple[float, float] = (0.2, 0.4)
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Lens, sensor and image pipeline.
+    """Lens, sensor and image pipeline."""
 
-    Parameters
-    ----------
-    blur_px : float
-        Standard deviation of the lens's Gaussian point spread. [px]
-    full_well_e, read_noise_e : float
-        Electrons at saturation and read noise. [e-]
-    gain : float
-        Exposure relative to the photo's.
-    white_balance : tuple of float
-        Gains on blue, green, red.
-    gamma : float
-        Encoding exponent is 1 / gamma above the linear toe.
-    shoulder : float
-        Radiance, as a share of saturation, from which highlights are compressed; 1 clips hard.
-    bayer : bool
-        Sample one colour a pixel and interpolate.
-    sharpen : float
-        Amount of unsharp masking that the pipeline adds.
-    colour_shift_px : float
-        Sideways shift between red and blue (lateral chromatic aberration). [px]
-    readout_s : float
-        Rolling shutter: time from the first row's exposure to the last's. [s]
-    jpeg_quality : int or None
-        4:2:0 JPEG round trip; None leaves it out.
-    """
-
-    blur_px: float = 0.7
+    blur_px: float = 0.7  # [px] standard deviation of the lens's Gaussian point spread
+    # `full_well_e`, `read_noise_e`: [e-] Electrons at saturation and read noise
     full_well_e: float = 6000.0
     read_noise_e: float = 4.0
-    gain: float = 1.0
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    gamma: float = 2.2
-    shoulder: float = 0.8
-    bayer: bool = True
-    sharpen: float = 0.0
-    colour_shift_px: float = 0.0
-    readout_s: float = 0.0
-    jpeg_quality: int | None = 92
+    gain: float = 1.0  # exposure relative to the photo's
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # gains on blue, green, red
+    gamma: float = 2.2  # encoding exponent is 1 / gamma above the linear toe
+    shoulder: float = 0.8  # radiance, as a share of saturation, from which highlights are compressed; 1 clips hard
+    bayer: bool = True  # sample one colour a pixel and interpolate
+    sharpen: float = 0.0  # amount of unsharp masking that the pipeline adds
+    colour_shift_px: float = 0.0  # [px] sideways shift between red and blue (lateral chromatic aberration)
+    readout_s: float = 0.0  # [s] rolling shutter: time from the first row's exposure to the last's
+    jpeg_quality: int | None = 92  # 4:2:0 JPEG round trip; None leaves it out
 
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """Something between camera and plate: everything on one side of a line in the image.
+    """Something between camera and plate: everything on one side of a line in the image."""
 
-    Parameters
-    ----------
-    angle_deg : float
-        Direction in the image, clockwise from right, towards the hidden side. [deg]
-    share : float
-        How much of the first face's extent along that direction is hidden, 0 to 1.
-    radiance : float
-        As a share of saturation.
-    softness_px : float
-        Half width of its blurred edge. [px]
-    """
-
-    angle_deg: float
-    share: float
-    radiance: float = 0.05
-    softness_px: float = 1.5
+    angle_deg: float  # [deg] direction in the image, clockwise from right, towards the hidden side
+    share: float  # how much of the first face's extent along that direction is hidden, 0 to 1
+    radiance: float = 0.05  # as a share of saturation
+    softness_px: float = 1.5  # [px] half width of its blurred edge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateScene:
-    """One exposure.
+    """One exposure."""
 
-    Parameters
-    ----------
-    camera : Camera
-        Intrinsics and mount.
-    faces : tuple of PlacedFace
-        Not overlapping; the first is the plate that shadows, glare and occluders refer to.
-    speed_m_s, exposure_s : float
-        Forward speed and exposure time.
-    spin_deg_s : tuple of float
-        Roll, pitch (nose down) and yaw (left) rates of the vehicle during the exposure. [deg/s]
-    body_deg : tuple of float
-        Roll, pitch (nose down) and yaw (left) of the vehicle against road and travel at mid-exposure. [deg]
-    road_reflectance : float
-        Of the road in the photo: its brightness over this is the light that falls on the plate.
-    night_light : float or None
-        Light on a white surface as a share of saturation, in place of the photo's; the photo is darkened too.
-    """
-
-    camera: Camera
-    faces: tuple[PlacedFace, ...]
+    camera: Camera  # intrinsics and mount
+    faces: tuple[PlacedFace, ...]  # not overlapping; the first is the plate that shadows, glare and occluders refer to
+    # `speed_m_s`, `exposure_s`: forward speed and exposure time
     speed_m_s: float = 0.0
     exposure_s: float = 0.001
+    # [deg/s] roll, pitch (nose down) and yaw (left) rates of the vehicle during the exposure
     spin_deg_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # [deg] roll, pitch (nose down) and yaw (left) of the vehicle against road and travel at mid-exposure
     body_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # of the road in the photo: its brightness over this is the light that falls on the plate
     road_reflectance: float = 0.22
+    # light on a white surface as a share of saturation, in place of the photo's; the photo is darkened too
     night_light: float | None = None
     shadow: Shadow = field(default_factory=Shadow)
     air: Air = field(default_factory=Air)

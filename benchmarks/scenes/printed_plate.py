@@ -24,44 +24,24 @@ _FINE = 4  # samples a texel and side, by which edges are mixed
 
 @dataclass(frozen=True, slots=True)
 class Stain:
-    """A round opaque stain.
+    """A round opaque stain."""
 
-    Parameters
-    ----------
-    x_mm, y_mm : float
-        Centre in the plate frame. [mm]
-    radius_mm : float
-        [mm]
-    reflectance : tuple of float
-        Blue, green, red.
-    """
-
+    # `x_mm`, `y_mm`: [mm] centre in the plate frame
     x_mm: float
     y_mm: float
     radius_mm: float
-    reflectance: Colour = (0.25, 0.27, 0.3)
+    reflectance: Colour = (0.25, 0.27, 0.3)  # blue, green, red
 
 
 @dataclass(frozen=True, slots=True)
 class PrintFaults:
-    """What went wrong when a plate was printed.
+    """What went wrong when a plate was printed."""
 
-    Parameters
-    ----------
-    stretch : float
-        The print is longer by this share along the direction of travel.
-    growth_mm : float
-        Every unit is larger by this on each of its sides; negative: smaller. [mm]
-    shifts_mm : mapping of (row, column) to (x, y)
-        Displaced units: to the right and up; they lie over the others. [mm]
-    faded : mapping of (row, column) to float
-        Units that moved by this share towards the other paint.
-    stains : tuple of Stain
-    """
-
-    stretch: float = 0.0
-    growth_mm: float = 0.0
+    stretch: float = 0.0  # the print is longer by this share along the direction of travel
+    growth_mm: float = 0.0  # [mm] every unit is larger by this on each of its sides; negative: smaller
+    # [mm] displaced units: to the right and up; they lie over the others
     shifts_mm: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
+    # units that moved by this share towards the other paint
     faded: dict[tuple[int, int], float] = field(default_factory=dict)
     stains: tuple[Stain, ...] = ()
 

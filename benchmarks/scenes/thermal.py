@@ -74,30 +74,14 @@ def draw_thermal(rng: np.random.Generator) -> tuple[PlateWarmth, ThermalSensor]:
 
 @dataclass(frozen=True, slots=True)
 class ThermalSensor:
-    """Uncooled bolometer.
+    """Uncooled bolometer."""
 
-    Parameters
-    ----------
-    lag_s : float
-        Thermal time constant of a pixel: it forgets exponentially, which draws a trail. [s]
-    blur_px : float
-        Standard deviation of the lens's Gaussian point spread. [px]
-    netd_k : float
-        Noise, and a tenth of it as fixed stripes of columns. [K]
-    span_k : float
-        Temperatures that the 256 grey levels cover. [K]
-    road_k : float
-        Standard deviation of the road's own differences. [K]
-    jpeg_quality : int or None
-        None keeps the frame as it is.
-    """
-
-    lag_s: float = 0.01
-    blur_px: float = 1.2
-    netd_k: float = 0.06
-    span_k: float = 25.0
-    road_k: float = 0.8
-    jpeg_quality: int | None = None
+    lag_s: float = 0.01  # [s] thermal time constant of a pixel: it forgets exponentially, which draws a trail
+    blur_px: float = 1.2  # [px] standard deviation of the lens's Gaussian point spread
+    netd_k: float = 0.06  # [K] noise, and a tenth of it as fixed stripes of columns
+    span_k: float = 25.0  # [K] Temperatures that the 256 grey levels cover
+    road_k: float = 0.8  # [K] standard deviation of the road's own differences
+    jpeg_quality: int | None = None  # None keeps the frame as it is
 
 
 def render_thermal_scene(

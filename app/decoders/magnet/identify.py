@@ -69,17 +69,10 @@ _MISSING_PROBABILITY = 0.5  # of a format with missing magnets, whose code is un
 
 @dataclass(frozen=True, slots=True)
 class TagFormat:
-    """Tags of M magnets over L metres on a grid of Seg_d, whatever their code.
+    """Tags of M magnets over L metres on a grid of Seg_d, whatever their code."""
 
-    Parameters
-    ----------
-    magnets : int
-        M.
-    length_m, segment_m : float
-        L and Seg_d. [m]
-    """
-
-    magnets: int = 3
+    magnets: int = 3  # m
+    # `length_m`, `segment_m`: [m] L and Seg_d
     length_m: float = 4.0
     segment_m: float = 1.0
 

@@ -397,7 +397,7 @@ class PlateFit:
     corners_covariance_px2: Array  # shape (8, 8)
     residual: float  # [1] root mean square residual on the camera's scale
     explained: float  # share of the pixels' variance that the model explains, at most 1
-    # `blur_px`, `motion`: [plate sides] standard deviation of the lens blur [px], length of the motion
+    # `blur_px`, `motion`: standard deviation of the lens blur [px], length of the motion [plate sides]
     blur_px: float
     motion: float
     pixels: int  # number of pixels that were used

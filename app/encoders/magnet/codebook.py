@@ -33,24 +33,15 @@ class CodebookFull(Conflict):
 
 @dataclass(frozen=True, slots=True)
 class CodebookRules:
-    """How far apart codes are kept.
+    """How far apart codes are kept."""
 
-    Parameters
-    ----------
-    conditions : ReadingConditions
-        The worst under which the codes must be read.
-    confusion : float
-        Largest probability with which a code may be taken for another one, the polarities being read right.
-    wrong_way_safe : bool
-        No code is the reverse of another one, nor its own, nor too near to it: every reading shows the direction.
-    survive_missing : bool
-        A code is read even when any one of its magnets is missed; from four magnets on.
-    """
-
+    # the worst under which the codes must be read
     conditions: ReadingConditions = field(default_factory=ReadingConditions)
+    # largest probability with which a code may be taken for another one, the polarities being read right
     confusion: float = 0.001
+    # no code is the reverse of another one, nor its own, nor too near to it: every reading shows the direction
     wrong_way_safe: bool = False
-    survive_missing: bool = False
+    survive_missing: bool = False  # a code is read even when any one of its magnets is missed; from four magnets on
 
     def __post_init__(self) -> None:
         separation_for(self.confusion)

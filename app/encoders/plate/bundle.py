@@ -259,23 +259,12 @@ _LONGEST_STEM = 60
 
 @dataclass(frozen=True, slots=True)
 class BundleOptions:
-    """Contents of a bundle.
+    """Contents of a bundle."""
 
-    Parameters
-    ----------
-    formats : tuple of ArtworkFormat
-        Files of each plate.
-    artwork : ArtworkOptions
-    sheet_mm : (width, height), optional
-        Also nest the plates on sheets of this size, in the same formats. [mm]
-    dpi : float
-        Of PNG files. [1/inch]
-    """
-
-    formats: tuple[ArtworkFormat, ...] = (ArtworkFormat.PDF, ArtworkFormat.SVG)
+    formats: tuple[ArtworkFormat, ...] = (ArtworkFormat.PDF, ArtworkFormat.SVG)  # files of each plate
     artwork: ArtworkOptions = field(default_factory=ArtworkOptions)
-    sheet_mm: tuple[float, float] | None = None
-    dpi: float = DEFAULT_DPI
+    sheet_mm: tuple[float, float] | None = None  # [mm] also nest the plates on sheets of this size, in the same formats
+    dpi: float = DEFAULT_DPI  # [1/inch] of PNG files
 
 
 def write_bundle(

@@ -48,39 +48,24 @@ MAX_URL_LENGTH = 150
 class PlateOrder:
     """One plate to make.
 
-    Parameters
-    ----------
-    plate_id : str
-        The registry's name for it, 1 to 64 characters.
-    code : PlateCode
-    geometry : PlateGeometry
-        Its ``n`` is the code's.
-    record_url : str
-        Address of the marker's public page, for the QR code on the margin; printable ASCII, at most 150 characters.
-        Empty: there is no QR code, and the margin states that.
-    revision : int
-        Revision of the record that the artwork shows, >= 1.
-    lon_deg, lat_deg : float, optional
-        Surveyed or planned position. [deg]
-    crs : str
-        Its coordinate reference system, realization and epoch, for the margin, at most 80 characters.
-    registered : bool
-        Whether the plate is in the registry; a draft is not, and the margin gives that as the reason for no QR code.
-
     Raises
     ------
     InvalidParameter
         A value is outside these limits, or the code is for another size of plate.
     """
 
-    plate_id: str
+    plate_id: str  # the registry's name for it, 1 to 64 characters
     code: PlateCode
-    geometry: PlateGeometry = field(default_factory=PlateGeometry)
+    geometry: PlateGeometry = field(default_factory=PlateGeometry)  # its ``n`` is the code's
+    # address of the marker's public page, for the QR code on the margin; printable ASCII, at most 150 characters.
+    # Empty: there is no QR code, and the margin states that.
     record_url: str = ""
-    revision: int = 1
+    revision: int = 1  # revision of the record that the artwork shows, >= 1
+    # `lon_deg`, `lat_deg`: [deg] surveyed or planned position
     lon_deg: float | None = None
     lat_deg: float | None = None
-    crs: str = ""
+    crs: str = ""  # its coordinate reference system, realization and epoch, for the margin, at most 80 characters
+    # whether the plate is in the registry; a draft is not, and the margin gives that as the reason for no QR code
     registered: bool = True
 
     def __post_init__(self) -> None:
@@ -142,18 +127,10 @@ def reference_text(realization: str | None, epoch: float | None, warning: str | 
 
 @dataclass(frozen=True, slots=True)
 class ArtworkOptions:
-    """What else a drawing shows.
+    """What else a drawing shows."""
 
-    Parameters
-    ----------
-    heaters : bool
-        Heating tracks under dark units and markers, on the layer HEATER.
-    leds : bool
-        Light sources under light units and markers, on the layer LED.
-    """
-
-    heaters: bool = False
-    leds: bool = False
+    heaters: bool = False  # Heating tracks under dark units and markers, on the layer HEATER
+    leds: bool = False  # light sources under light units and markers, on the layer LED
 
 
 # === QR codes of many addresses that differ in a few characters.

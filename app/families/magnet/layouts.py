@@ -113,22 +113,13 @@ _NEVER_BROKEN = ("magnet-spacing", "line-spacing")
 
 @dataclass(frozen=True, slots=True)
 class LaneInput:
-    """A line in the direction of travel as it was sent.
+    """A line in the direction of travel as it was sent."""
 
-    Parameters
-    ----------
-    coordinates : tuple of (float, float)
-        Longitude and latitude [deg], or easting and northing [m] where `projected`.
-    field : str
-        Name of the coordinates in errors.
-    provenance : PositionIn
-        Height and reference system, and how the line was surveyed; without coordinates.
-    """
-
+    # longitude and latitude [deg], or easting and northing [m] where `projected`
     coordinates: tuple[tuple[float, float], ...]
     projected: bool
-    field: str
-    provenance: PositionIn
+    field: str  # name of the coordinates in errors
+    provenance: PositionIn  # height and reference system, and how the line was surveyed; without coordinates
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,7 @@ class Piece(NamedTuple):
     # `s`, `length`: [m] distance of its start along the line, and its length
     s: float
     length: float
-    # `x`, `y`, `hdg`: [rad] start [m] and direction there, counter-clockwise from x
+    # `x`, `y`, `hdg`: start [m] and direction there, counter-clockwise from x [rad]
     x: float
     y: float
     hdg: float

@@ -126,19 +126,12 @@ _INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 @dataclass(frozen=True, slots=True)
 class CoarsePosition:
-    """The vehicle's approximate position.
+    """The vehicle's approximate position."""
 
-    Parameters
-    ----------
-    lon_deg, lat_deg : float
-        WGS 84. [deg]
-    accuracy_m : float
-        Radius that holds the true position with near certainty, at most 20 km. [m]
-    """
-
+    # `lon_deg`, `lat_deg`: [deg] WGS 84
     lon_deg: float
     lat_deg: float
-    accuracy_m: float
+    accuracy_m: float  # [m] radius that holds the true position with near certainty, at most 20 km
 
     def __post_init__(self) -> None:
         check_lon_lat(self.lon_deg, self.lat_deg, field="coarse_position")
@@ -158,39 +151,26 @@ class CoarsePosition:
 
 @dataclass(frozen=True, slots=True)
 class CameraSetup:
-    """A camera as a vehicle declares it: intrinsics, or the horizontal field of view, and the mount.
+    """A camera as a vehicle declares it: intrinsics, or the horizontal field of view, and the mount."""
 
-    Parameters
-    ----------
-    width_px, height_px : int, optional
-        Size of the frames; must be theirs. [px]
-    fx_px, fy_px, cx_px, cy_px : float, optional
-        All four, or none with `horizontal_fov_deg`. [px]
-    distortion : tuple of float
-        OpenCV's coefficients, with intrinsics only.
-    horizontal_fov_deg : float, optional
-        Field of view of an undistorted camera. [deg]
-    height_m, depression_deg, azimuth_deg, roll_deg, forward_m, left_m : float
-        Mount, as in `Camera`.
-    readout_s : float
-        Rolling shutter, as in `Camera`. [s]
-    """
-
+    # `width_px`, `height_px`: [px] size of the frames; must be theirs
     width_px: int | None = None
     height_px: int | None = None
+    # `fx_px`, `fy_px`, `cx_px`, `cy_px`: [px] all four, or none with `horizontal_fov_deg`
     fx_px: float | None = None
     fy_px: float | None = None
     cx_px: float | None = None
     cy_px: float | None = None
-    distortion: tuple[float, ...] = ()
-    horizontal_fov_deg: float | None = None
+    distortion: tuple[float, ...] = ()  # OpenCV's coefficients, with intrinsics only
+    horizontal_fov_deg: float | None = None  # [deg] field of view of an undistorted camera
+    # `height_m`, `depression_deg`, `azimuth_deg`, `roll_deg`, `forward_m`, `left_m`: mount, as in `Camera`
     height_m: float = 1.57
     depression_deg: float = 23.0
     azimuth_deg: float = 0.0
     roll_deg: float = 0.0
     forward_m: float = 0.0
     left_m: float = 0.0
-    readout_s: float = 0.0
+    readout_s: float = 0.0  # [s] rolling shutter, as in `Camera`
 
     def __post_init__(self) -> None:
         intrinsics = [name for name in _INTRINSICS if getattr(self, name) is not None]
@@ -272,45 +252,23 @@ class ContextInput:
 
 @dataclass(frozen=True, slots=True)
 class DecodeContext:
-    """Everything that comes with an upload.
+    """Everything that comes with an upload."""
 
-    Parameters
-    ----------
-    coarse_position : CoarsePosition, optional
-        Without it nothing is looked up in the registry.
-    heading_deg : float, optional
-        Of the vehicle, clockwise from true north. [deg]
-    camera : CameraSetup, optional
-    thermal : bool
-    thermal_range : (float, float), optional
-        Counts that become 0 and 255 in 16-bit thermal frames. [counts]
-    captured_at : datetime, optional
-        Aware.
-    trace : dict, optional
-        The upload is a magnetometer trace, declared like this (`app.services.decodes.tasks.trace_terms`).
-    packets : dict, optional
-        The upload is a packet log, declared like this (`app.services.decodes.tasks.packet_terms`).
-    frames : dict, optional
-        Frame rate, list and track of the frames of a drive, declared like this
-        (`app.services.decodes.tasks.frame_terms`).
-    vehicle : dict, optional
-        Id, name and version of the vehicle, and the source of each member
-        (`app.services.fleet.vehicles.inherit`).
-    file_name : str, optional
-        Of the uploaded file, for people.
-    """
-
-    coarse_position: CoarsePosition | None = None
-    heading_deg: float | None = None
+    coarse_position: CoarsePosition | None = None  # without it nothing is looked up in the registry
+    heading_deg: float | None = None  # [deg] of the vehicle, clockwise from true north
     camera: CameraSetup | None = None
     thermal: bool = False
-    thermal_range: tuple[float, float] | None = None
-    captured_at: datetime | None = None
+    thermal_range: tuple[float, float] | None = None  # [counts] counts that become 0 and 255 in 16-bit thermal frames
+    captured_at: datetime | None = None  # aware
+    # the upload is a magnetometer trace, declared like this (`app.services.decodes.tasks.trace_terms`)
     trace: dict[str, Any] | None = None
+    # the upload is a packet log, declared like this (`app.services.decodes.tasks.packet_terms`)
     packets: dict[str, Any] | None = None
+    # frame rate, list and track of the frames of a drive, declared like this (`app.services.decodes.tasks.frame_terms`)
     frames: dict[str, Any] | None = None
+    # id, name and version of the vehicle, and the source of each member (`app.services.fleet.vehicles.inherit`)
     vehicle: dict[str, Any] | None = None
-    file_name: str | None = None
+    file_name: str | None = None  # of the uploaded file, for people
 
     def __post_init__(self) -> None:
         if self.trace is not None and self.packets is not None:
