@@ -30,8 +30,7 @@ from app.registry.column_types import row_of
 from app.registry.database import Database
 from app.registry.engines import across_agencies
 from app.registry.features import feature_text
-from app.registry.marker_rows import MarkerRow
-from app.registry.tables import markers
+from app.registry.marker_rows import MarkerRow, markers
 from app.services.access.access import Scope
 from app.settings import Settings
 from app.worker import running_worker

@@ -24,7 +24,7 @@ from app.registry import agencies
 from app.registry import decodes as store
 from app.registry.column_types import new_id
 from app.registry.decodes import DecodeRow
-from app.registry.tables import markers
+from app.registry.marker_rows import markers
 from app.storage.blobs import new_blob_key
 from benchmarks.faults.stored import Stored
 from benchmarks.faults.writers import IMPORT_ROAD, IMPORT_ROWS, Acknowledged

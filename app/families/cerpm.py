@@ -55,8 +55,7 @@ from app.registry import markers as cerpms
 from app.registry.bulk_load import Columns
 from app.registry.column_types import row_of
 from app.registry.lines import CerpmRuns
-from app.registry.marker_rows import CodeRow, MarkerRow
-from app.registry.tables import markers
+from app.registry.marker_rows import CodeRow, MarkerRow, markers
 from app.surveys.georeference import GeoreferencedSurvey
 
 # === The row of a CERPM as values of the core: what it sends, its side, its speed limit and its radio.

@@ -9,10 +9,67 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.registry import column_types
 from app.registry.audit import Author, record
-from app.registry.column_types import fetch_all, find_one, new_id, select_rows
+from app.registry.column_types import (
+    ID,
+    UtcTime,
+    agency_column,
+    fetch_all,
+    find_one,
+    metadata,
+    new_id,
+    one_of,
+    select_rows,
+)
 from app.registry.resources import Resource
-from app.registry.tables import agencies, api_keys, idempotency_keys
+
+agencies = sa.Table(
+    "agencies",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    sa.Column("name", sa.String(200), nullable=False, unique=True),
+    sa.Column("created_at", UtcTime, nullable=False),
+)
+
+api_keys = sa.Table(
+    "api_keys",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("holder_id", ID, nullable=False),  # keys that replace one another have the id of the first
+    sa.Column("label", sa.String(200), nullable=False),
+    sa.Column("prefix", sa.String(16), nullable=False),
+    sa.Column("sha256", sa.String(64), nullable=False, unique=True),
+    sa.Column("scope", sa.String(16), nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("expires_at", UtcTime),
+    sa.Column("revoked_at", UtcTime),
+    sa.Column("last_used_at", UtcTime),
+    one_of("scope", column_types.SCOPES),
+)
+
+# the key that an agency's CERPMs derive theirs from, encrypted under the server's own
+agency_secrets = sa.Table(
+    "agency_secrets",
+    metadata,
+    sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("wrapped", sa.LargeBinary, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+)
+
+idempotency_keys = sa.Table(
+    "idempotency_keys",
+    metadata,
+    sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("holder_id", sa.String(200), primary_key=True, server_default=""),  # whose request; empty: a job's own
+    sa.Column("key", sa.String(200), primary_key=True),
+    sa.Column("request_sha256", sa.String(64), nullable=False),
+    sa.Column("response", sa.JSON, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("expires_at", UtcTime, nullable=False),
+    sa.Index("ix_idempotency_keys_expires_at", "expires_at"),
+)
 
 
 class AgencyRow(NamedTuple):

@@ -22,10 +22,27 @@ import sqlalchemy as sa
 from pydantic import JsonValue
 
 from app.registry.bulk_load import Columns, JsonTexts
-from app.registry.column_types import fetch_all, find_one, select_rows
+from app.registry.column_types import ID, UtcTime, fetch_all, find_one, metadata, select_rows
 from app.registry.conditions import is_graded, regraded
-from app.registry.marker_rows import PUBLIC
-from app.registry.tables import audit_log, marker_versions, markers
+from app.registry.marker_rows import PUBLIC, marker_versions, markers
+
+# what changed an agency's part of the registry: a chain, each entry with the hash of the one before (audit.py)
+audit_log = sa.Table(
+    "audit_log",
+    metadata,
+    sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("key_id", sa.String(200)),
+    sa.Column("action", sa.String(40), nullable=False),
+    sa.Column("subject", sa.String(200)),
+    sa.Column("detail", sa.JSON(none_as_null=True)),
+    sa.Column("versions", sa.BigInteger, nullable=False),
+    sa.Column("digest", sa.String(64), nullable=False),
+    sa.Column("previous_hash", sa.String(64), nullable=False),
+    sa.Column("hash", sa.String(64), nullable=False),
+)
 
 NO_ENTRY = "0" * 64
 """What the first entry of a chain names as the hash before it."""

@@ -8,17 +8,13 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from app.registry.jobs import JobKind
-from app.registry.tables import decodes, jobs
-from app.registry.work_tables import (
-    alignments,
-    damage_reports,
-    decode_versions,
-    plans,
-    reprocessed_decodes,
-    upload_parts,
-    uploads,
-)
+from app.registry.decodes import decodes
+from app.registry.jobs import JobKind, jobs
+from app.registry.plan_states import plans
+from app.registry.plans import alignments
+from app.registry.public_pages import damage_reports
+from app.registry.reprocessings import decode_versions, reprocessed_decodes
+from app.registry.uploads import upload_parts, uploads
 
 COLUMNS = (
     decodes.c.upload_key,

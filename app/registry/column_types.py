@@ -88,6 +88,10 @@ def _random_62_bits(count: int) -> list[int]:
     return [value & (1 << 62) - 1 for value in values]
 
 
+COUNTED_ID = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+"""An integer key that the database counts."""
+
+
 def new_id(now: datetime) -> str:
     """A UUID version 7 (RFC 9562, section 5.7) as text."""
     milliseconds = int(now.timestamp() * 1000) & ((1 << 48) - 1)

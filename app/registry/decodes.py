@@ -14,9 +14,41 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import NotFound
-from app.registry.column_types import UtcTime, fetch_all, find_one, select_rows
-from app.registry.jobs import JobState
-from app.registry.tables import decodes, jobs, observations
+from app.registry.column_types import ID, UtcTime, agency_column, fetch_all, find_one, metadata, select_rows
+from app.registry.jobs import JobState, jobs
+
+# an upload that is decoded; one that is not decoded while its sender waits has a job of the same id
+decodes = sa.Table(
+    "decodes",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("kind", sa.String(32), nullable=False),  # of the upload
+    sa.Column("holder_id", sa.String(200)),  # of the key that uploaded it
+    sa.Column("context", sa.JSON, nullable=False),
+    sa.Column("upload_key", sa.String(200)),
+    sa.Column("upload_bytes", sa.BigInteger),
+    sa.Column("upload_sha256", sa.String(64)),
+    sa.Column("picture_key", sa.String(200)),
+    sa.Column("result", sa.JSON(none_as_null=True)),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("finished_at", UtcTime),  # when the result was stored
+    sa.Column("decoder", sa.String(200)),  # of the result, with its release
+    sa.Index("ix_decodes_agency_id_id", "agency_id", "id"),
+)
+
+observations = sa.Table(
+    "observations",
+    metadata,
+    sa.Column("decode_id", ID, sa.ForeignKey("decodes.id"), primary_key=True),
+    sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), primary_key=True),
+    sa.Column("frame", sa.Integer, primary_key=True, autoincrement=False, server_default="0"),
+    agency_column(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("what", sa.String(32), nullable=False),
+    sa.Column("detail", sa.JSON(none_as_null=True)),
+    sa.Index("ix_observations_marker_id_at", "marker_id", "at"),
+)
 
 
 class DecodeRow(NamedTuple):

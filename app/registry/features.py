@@ -19,10 +19,9 @@ import sqlalchemy as sa
 from app.geodesy.systems import ELLIPSOID, is_ellipsoidal
 from app.registry.bulk_load import Columns, JsonTexts, json_objects, json_texts
 from app.registry.conditions import Condition, condition_sql
-from app.registry.marker_rows import MarkerRow
+from app.registry.marker_rows import MarkerRow, markers
 from app.registry.plan_states import find_plan_states
 from app.registry.spatial import Box, proposed_by_index
-from app.registry.tables import markers
 
 _WIDE_DEG2 = 2_500.0  # from here on most markers are inside, and the order of the page finds them sooner than the index
 

@@ -11,9 +11,64 @@ import sqlalchemy as sa
 
 from app import tracing
 from app.errors import NotFound
-from app.registry.column_types import UtcTime, fetch_all, fetch_in, find_one, select_rows
-from app.registry.tables import jobs
-from app.registry.webhooks import add_event
+from app.registry import column_types
+from app.registry.column_types import (
+    ID,
+    UtcTime,
+    agency_column,
+    fetch_all,
+    fetch_in,
+    find_one,
+    metadata,
+    one_of,
+    select_rows,
+)
+from app.registry.webhooks import add_event, events
+
+# work that outlives the request that asked for it; what is true of a job is true in its row, and nowhere else
+UNFINISHED_JOBS = sa.text("state IN ('queued', 'running')")
+
+jobs = sa.Table(
+    "jobs",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("holder_id", sa.String(200)),  # of the key that asked for it
+    sa.Column("kind", sa.String(32), nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("progress", sa.Double, nullable=False, server_default="0"),
+    sa.Column("cancel_requested", sa.Boolean, nullable=False, server_default=sa.false()),
+    sa.Column("input", sa.JSON, nullable=False),
+    sa.Column("upload_key", sa.String(200)),
+    sa.Column("result", sa.JSON(none_as_null=True)),
+    sa.Column("error", sa.JSON(none_as_null=True)),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("finished_at", UtcTime),
+    sa.Column("subject_id", ID),  # of the row that it is about, e.g. a plan
+    sa.Column("steps_done", sa.Integer),
+    sa.Column("steps_total", sa.Integer),
+    sa.Column("started_at", UtcTime),  # first
+    sa.Column("runner", sa.String(100)),  # the run of a job that has the lease
+    sa.Column("lease_until", UtcTime),
+    sa.Column("turn_at", UtcTime),  # when it was started last
+    sa.Column("dead_letter", sa.Boolean, nullable=False, server_default=sa.false()),
+    sa.Column("traceparent", sa.String(55)),  # of the span that made it
+    one_of("state", column_types.JOB_STATES),
+    sa.Index("ix_jobs_agency_id_kind_id", "agency_id", "kind", "id"),
+    sa.Index("ix_jobs_agency_id_id", "agency_id", "id"),
+    sa.Index("ix_jobs_state", "state"),
+    sa.Index("ix_jobs_subject_id", "subject_id"),
+    sa.Index("ix_jobs_agency_id_kind_turn_at", "agency_id", "kind", "turn_at"),
+    sa.Index(
+        "ix_jobs_unfinished",
+        "kind",
+        "agency_id",
+        "id",
+        postgresql_where=UNFINISHED_JOBS,
+        sqlite_where=UNFINISHED_JOBS,
+    ),
+)
 
 JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 UNFINISHED = ("queued", "running")
@@ -224,6 +279,14 @@ def finish_job(
         values["progress"] = 1.0
     statement = sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state.in_(UNFINISHED)).values(**values)
     return end_job(connection, statement, now)
+
+
+def event_of_holder(agency_id: str, holder_id: str) -> sa.ColumnElement[bool]:
+    """Whether an event is about a job that a holder asked for."""
+    own = sa.select(jobs.c.id).where(
+        jobs.c.id == events.c.subject_id, jobs.c.agency_id == agency_id, jobs.c.holder_id == holder_id
+    )
+    return sa.and_(events.c.kind.like("job.%"), own.exists())
 
 
 def delete_job(connection: sa.Connection, agency_id: str, job_id: str) -> bool:

@@ -19,8 +19,9 @@ from pyproj import Geod
 
 from app.errors import MalformedRequest
 from app.registry.features import Field
+from app.registry.marker_rows import markers
+from app.registry.markers import magnets
 from app.registry.spatial import Box, box_around, within_box
-from app.registry.tables import magnets, markers
 
 MAX_GAP_M = 100.0
 """Neighbours in a run of CERPMs are at most so far apart by measure. [m]"""

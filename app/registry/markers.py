@@ -14,12 +14,23 @@ import sqlalchemy as sa
 from app.errors import NotFound, StaleVersion
 from app.geodesy.systems import ELLIPSOID
 from app.markers.magnet_design import CODEBOOK_FORMAT, Codebook
+from app.registry.agencies import agency_secrets
 from app.registry.audit import AuditEntry, add_versions
 from app.registry.bulk_load import Columns, json_objects, large_load, load_columns
-from app.registry.column_types import fetch_all, fetch_in, find_one, row_of, select_rows
+from app.registry.column_types import (
+    ID,
+    UtcTime,
+    agency_column,
+    fetch_all,
+    fetch_in,
+    find_one,
+    metadata,
+    row_of,
+    select_rows,
+)
 from app.registry.engines import seeing_every_agency
 from app.registry.features import feature_text, feature_texts
-from app.registry.marker_rows import MARKERS, CodeRow, MarkerRow
+from app.registry.marker_rows import MARKERS, CodeRow, MarkerRow, marker_versions, markers
 from app.registry.resources import Resource
 from app.registry.spatial import (
     Area,
@@ -31,7 +42,55 @@ from app.registry.spatial import (
     within_box,
     within_radius,
 )
-from app.registry.tables import agency_secrets, cerpm_spans, codebooks, magnets, marker_versions, markers
+
+# where the magnets of magnet markers lie: what follows from their layouts, kept for searches
+magnets = sa.Table(
+    "magnets",
+    metadata,
+    sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
+    sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), nullable=False),
+    sa.Column("number", sa.Integer, nullable=False),
+    agency_column(),
+    sa.Column("lon_deg", sa.Double, nullable=False),
+    sa.Column("lat_deg", sa.Double, nullable=False),
+    sa.Column("polarity", sa.String(1), nullable=False),
+    sa.Column("phi_deg", sa.Integer, nullable=False),
+    sa.UniqueConstraint("marker_id", "number"),
+    sqlite_autoincrement=True,
+)
+
+codebooks = sa.Table(
+    "codebooks",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("name", sa.String(80), nullable=False),
+    sa.Column("design", sa.JSON, nullable=False),
+    sa.Column("rules", sa.JSON, nullable=False),
+    sa.Column("figures", sa.JSON, nullable=False),
+    sa.Column("entries", sa.JSON, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_codebooks_agency_id_id", "agency_id", "id"),
+)
+
+# which transmissions of a CERPM were heard and when: what is sent again is known by it
+cerpm_spans = sa.Table(
+    "cerpm_spans",
+    metadata,
+    sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
+    agency_column(),
+    sa.Column("number", sa.BigInteger, nullable=False),
+    sa.Column("first_sequence", sa.BigInteger, nullable=False),
+    sa.Column("last_sequence", sa.BigInteger, nullable=False),
+    sa.Column("first_heard_s", sa.Double),  # seconds since 1970-01-01 UTC; null where the log had no times
+    sa.Column("last_heard_s", sa.Double),
+    sa.Column("decode_id", ID, sa.ForeignKey("decodes.id"), nullable=False),
+    sa.Index("ix_cerpm_spans_agency_id_number", "agency_id", "number"),
+    sqlite_autoincrement=True,
+)
 
 # === Codebooks as they are stored.
 

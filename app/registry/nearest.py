@@ -20,10 +20,9 @@ import sqlalchemy as sa
 
 from app.registry.column_types import row_maker
 from app.registry.features import in_box
-from app.registry.marker_rows import PUBLIC, MarkerRow
+from app.registry.marker_rows import PUBLIC, MarkerRow, markers
 from app.registry.markers import MarkerFilter, conditions_of
 from app.registry.spatial import Box, FloatArray, box_around, distances_m, within_box
-from app.registry.tables import markers
 
 # === Places of markers in many circles.
 

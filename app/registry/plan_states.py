@@ -11,7 +11,44 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
-from app.registry.tables import audit_log, markers, plan_markers, plans
+from app.registry import column_types
+from app.registry.audit import audit_log
+from app.registry.column_types import ID, UtcTime, agency_column, metadata, one_of
+from app.registry.marker_rows import markers
+
+plans = sa.Table(
+    "plans",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("alignment_id", ID, sa.ForeignKey("alignments.id"), nullable=False),
+    sa.Column("name", sa.String(80), nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
+    sa.Column("rules", sa.JSON, nullable=False),
+    sa.Column("document_key", sa.String(200), nullable=False),  # of the blob with the placed markers
+    sa.Column("summary", sa.JSON, nullable=False),
+    sa.Column("proof", sa.JSON(none_as_null=True)),
+    sa.Column("author", sa.String(200), nullable=False),
+    sa.Column("author_id", sa.String(200), nullable=False),  # holder of the key that made what is to be approved
+    sa.Column("approver", sa.String(200)),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    one_of("status", column_types.PLAN_STATUSES),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_plans_agency_id_id", "agency_id", "id"),
+    sa.Index("ix_plans_alignment_id", "alignment_id"),
+)
+
+plan_markers = sa.Table(
+    "plan_markers",
+    metadata,
+    sa.Column("plan_id", ID, sa.ForeignKey("plans.id"), primary_key=True),
+    sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),  # of the first of its planned markers
+    agency_column(),
+    sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), nullable=False),
+    sa.Index("ix_plan_markers_marker_id", "marker_id"),
+)
 
 COMMITTED, BUILT, SURVEYED = "committed", "built", "surveyed"
 _MAX_KNOWN = 4096  # agencies whose states are kept; source: as extents of collections (services/markers/features.py)

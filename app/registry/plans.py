@@ -9,13 +9,51 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from app.registry.bulk_load import Columns, load_columns
-from app.registry.column_types import columns_of, fetch_all
-from app.registry.jobs import UNFINISHED
-from app.registry.marker_rows import MARKERS, MarkerRow
+from app.registry.column_types import ID, UtcTime, agency_column, columns_of, fetch_all, metadata
+from app.registry.jobs import UNFINISHED, jobs
+from app.registry.marker_rows import MARKERS, MarkerRow, markers
 from app.registry.markers import MarkerFilter, conditions_of
+from app.registry.plan_states import plan_markers, plans
 from app.registry.resources import Resource
 from app.registry.spatial import Box, within_box
-from app.registry.tables import alignments, jobs, markers, plan_markers, plan_versions, plans, proof_units
+
+alignments = sa.Table(
+    "alignments",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("name", sa.String(80), nullable=False),
+    sa.Column("source_key", sa.String(200), nullable=False),  # of the blob with the file as it came
+    sa.Column("source_sha256", sa.String(64), nullable=False),
+    sa.Column("declaration", sa.JSON, nullable=False),
+    sa.Column("summary", sa.JSON, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_alignments_agency_id_id", "agency_id", "id"),
+)
+
+plan_versions = sa.Table(
+    "plan_versions",
+    metadata,
+    sa.Column("plan_id", ID, sa.ForeignKey("plans.id"), primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    agency_column(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("why", sa.String(500)),
+    sa.Column("plan", sa.JSON, nullable=False),
+)
+
+proof_units = sa.Table(
+    "proof_units",
+    metadata,
+    sa.Column("job_id", ID, sa.ForeignKey("jobs.id"), primary_key=True),
+    sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),  # of the unit among those of the proof
+    agency_column(),
+    sa.Column("result", sa.JSON, nullable=False),
+)
 
 # === Queries on finished units of proofs, from which an interrupted proof goes on.
 

@@ -10,11 +10,43 @@ import sqlalchemy as sa
 from typing_extensions import TypedDict
 
 from app.registry.audit import AuditEntry, add_versions
-from app.registry.column_types import fetch_all
+from app.registry.column_types import ID, UtcTime, agency_column, fetch_all, metadata
 from app.registry.features import feature_text
-from app.registry.marker_rows import MARKERS, MarkerRow
+from app.registry.marker_rows import MARKERS, MarkerRow, markers
 from app.registry.resources import Resource
-from app.registry.tables import markers, road_versions, roads
+
+roads = sa.Table(
+    "roads",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("name", sa.String(200), nullable=False),
+    sa.Column("parts", sa.JSON, nullable=False),  # of the axis: lines of longitude and latitude
+    sa.Column("given", sa.JSON, nullable=False),  # frame of the geometry as it came
+    sa.Column("calibration", sa.JSON, nullable=False),
+    sa.Column("length_m", sa.Double, nullable=False),
+    sa.Column("from_m", sa.Double, nullable=False),
+    sa.Column("to_m", sa.Double, nullable=False),
+    sa.Column("localization_grade", sa.String(64), nullable=False),
+    sa.Column("transform_note", sa.String(500)),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_roads_agency_id_id", "agency_id", "id"),
+)
+
+road_versions = sa.Table(
+    "road_versions",
+    metadata,
+    sa.Column("road_id", ID, sa.ForeignKey("roads.id"), primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    agency_column(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("why", sa.String(500)),
+    sa.Column("road", sa.JSON, nullable=False),
+)
 
 _CHUNK = 1000
 

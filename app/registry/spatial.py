@@ -24,7 +24,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
-from app.registry.tables import markers
+from app.registry.marker_rows import markers
 
 # === Fills an empty R*Tree of SQLite in one pass: points are sorted into full nodes instead of inserted one by one.
 #

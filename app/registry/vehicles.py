@@ -8,9 +8,76 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
-from app.registry.column_types import columns_of, row_maker
+from app.registry.agencies import api_keys
+from app.registry.column_types import ID, UtcTime, agency_column, columns_of, metadata, one_of, row_maker
 from app.registry.resources import Resource
-from app.registry.tables import api_keys, calibrations, vehicle_keys, vehicle_uploads, vehicle_versions, vehicles
+
+VEHICLE_STATUSES = ("active", "retired")
+
+vehicles = sa.Table(
+    "vehicles",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("name", sa.String(80), nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
+    sa.Column("note", sa.String(500)),
+    sa.Column("profile", sa.JSON, nullable=False),  # the part of a decode's context that stays the same
+    sa.Column("version", sa.Integer, nullable=False),
+    # counted in the transaction that stores an upload or its result; they make no version
+    sa.Column("uploads", sa.BigInteger, nullable=False, server_default="0"),
+    sa.Column("driven_m", sa.Double, nullable=False, server_default="0"),
+    sa.Column("last_seen_at", UtcTime),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.UniqueConstraint("agency_id", "name"),
+    one_of("status", VEHICLE_STATUSES),
+    sa.Index("ix_vehicles_agency_id_id", "agency_id", "id"),
+)
+
+vehicle_versions = sa.Table(
+    "vehicle_versions",
+    metadata,
+    sa.Column("vehicle_id", ID, sa.ForeignKey("vehicles.id"), primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    agency_column(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("why", sa.String(500)),
+    sa.Column("vehicle", sa.JSON, nullable=False),
+)
+
+# holders of keys that speak for a vehicle: api_keys.holder_id, which stays when a key is replaced
+vehicle_keys = sa.Table(
+    "vehicle_keys",
+    metadata,
+    sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("key_id", sa.String(200), primary_key=True),
+    sa.Column("vehicle_id", ID, sa.ForeignKey("vehicles.id"), nullable=False),
+    sa.Index("ix_vehicle_keys_vehicle_id", "vehicle_id"),
+)
+
+vehicle_uploads = sa.Table(
+    "vehicle_uploads",
+    metadata,
+    sa.Column("decode_id", ID, sa.ForeignKey("decodes.id"), primary_key=True),
+    sa.Column("vehicle_id", ID, sa.ForeignKey("vehicles.id"), nullable=False),
+    agency_column(),
+    sa.Column("version", sa.Integer, nullable=False),  # of the vehicle's profile
+    sa.Column("driven_m", sa.Double),  # null until the decode is done
+    sa.Index("ix_vehicle_uploads_vehicle_id_decode_id", "vehicle_id", "decode_id"),
+)
+
+calibrations = sa.Table(
+    "calibrations",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("result", sa.JSON, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Index("ix_calibrations_agency_id_id", "agency_id", "id"),
+)
 
 
 class VehicleRow(NamedTuple):

@@ -9,9 +9,78 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from app.errors import NotFound
-from app.registry.column_types import fetch_all, find_one, select_rows
-from app.registry.tables import jobs
-from app.registry.work_tables import events, webhook_deliveries, webhooks
+from app.registry.column_types import (
+    COUNTED_ID,
+    ID,
+    UtcTime,
+    agency_column,
+    fetch_all,
+    find_one,
+    metadata,
+    one_of,
+    select_rows,
+)
+
+WEBHOOK_STATES = ("active", "disabled")
+
+DELIVERY_STATES = ("waiting", "delivered", "failed")
+
+# what happened that others want to know: written in the transaction in which it happens. Writes come one after
+# another, so ids rise in the order of commits, and whoever reads on after an id misses nothing
+events = sa.Table(
+    "events",
+    metadata,
+    sa.Column("id", COUNTED_ID, primary_key=True, autoincrement=True),
+    agency_column(),
+    sa.Column("kind", sa.String(40), nullable=False),
+    sa.Column("subject_id", sa.String(200)),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("detail", sa.JSON(none_as_null=True)),
+    sa.Index("ix_events_agency_id_id", "agency_id", "id"),
+    sqlite_autoincrement=True,
+)
+
+webhooks = sa.Table(
+    "webhooks",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("url", sa.String(500), nullable=False),
+    sa.Column("events", sa.JSON, nullable=False),  # kinds, or their beginnings with .*
+    sa.Column("sealed_secret", sa.LargeBinary, nullable=False),  # under the server's key
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("reason", sa.String(500)),  # why it is disabled
+    sa.Column("last_event_id", sa.BigInteger, nullable=False),  # up to which events have become deliveries
+    sa.Column("last_success_at", UtcTime),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    one_of("state", WEBHOOK_STATES),
+    sa.Index("ix_webhooks_agency_id_id", "agency_id", "id"),
+)
+
+# one event for one webhook; a row is leased by moving `due_at`, so that two processes do not send it together
+webhook_deliveries = sa.Table(
+    "webhook_deliveries",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("webhook_id", ID, sa.ForeignKey("webhooks.id", ondelete="CASCADE"), nullable=False),
+    sa.Column("event_id", sa.BigInteger, nullable=False),
+    sa.Column("kind", sa.String(40), nullable=False),
+    sa.Column("body", sa.Text, nullable=False),  # as it is signed and sent
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("due_at", UtcTime, nullable=False),
+    sa.Column("give_up_at", UtcTime, nullable=False),
+    sa.Column("status", sa.Integer),  # of the last response
+    sa.Column("error", sa.String(300)),  # of the last attempt
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("ended_at", UtcTime),
+    one_of("state", DELIVERY_STATES),
+    sa.UniqueConstraint("webhook_id", "event_id"),
+    sa.Index("ix_webhook_deliveries_state_due_at", "state", "due_at"),
+    sa.Index("ix_webhook_deliveries_webhook_id_id", "webhook_id", "id"),
+)
 
 # === Events of an agency in the order in which they were committed: what webhooks and other subscribers are sent.
 #
@@ -58,7 +127,7 @@ def list_events(
     *,
     after: int = 0,
     job_kinds: Sequence[str] | None = None,
-    holder_id: str | None = None,
+    about: sa.ColumnElement[bool] | None = None,
     limit: int = 100,
 ) -> list[EventRow]:
     """Events after one, oldest first.
@@ -67,18 +136,15 @@ def list_events(
     ----------
     job_kinds : sequence of str, optional
         Of the events of jobs, those of these kinds only.
-    holder_id : str, optional
-        Events of jobs that this holder asked for, and no others.
+    about : condition, optional
+        What the events are about, as of `app.registry.jobs.event_of_holder`.
     """
     query = select_rows(EventRow, events).where(_E.agency_id == agency_id, _E.id > after)
     if job_kinds is not None:
         job_kind = _E.detail["job_kind"].as_string()
         query = query.where(sa.or_(_E.kind.not_like("job.%"), job_kind.in_(job_kinds)))
-    if holder_id is not None:
-        own = sa.select(jobs.c.id).where(
-            jobs.c.id == _E.subject_id, jobs.c.agency_id == agency_id, jobs.c.holder_id == holder_id
-        )
-        query = query.where(_E.kind.like("job.%"), own.exists())
+    if about is not None:
+        query = query.where(about)
     return fetch_all(connection, query.order_by(_E.id).limit(limit), EventRow)
 
 

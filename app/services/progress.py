@@ -20,7 +20,7 @@ from app.registry import jobs as registry_jobs
 from app.registry import webhooks as store
 from app.registry.database import Database
 from app.registry.engines import across_agencies
-from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState
+from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState, event_of_holder
 from app.services.access.access import AGENCY_SCOPES, Caller, Scope
 from app.services.blobs import delete_unused, staged
 from app.services.documents import ErrorDocument
@@ -200,10 +200,11 @@ class AgencyEvents:
 
     def list(self, caller: Caller, after: int, limit: int = 100) -> list[EventDocument]:
         """Events after one, oldest first; of jobs those that the caller may read. A vehicle sees nothing else."""
-        kinds = visible_kinds(caller)
+        kinds, holder_id = visible_kinds(caller), caller.own_key_id
+        about = None if holder_id is None else event_of_holder(caller.agency_id, holder_id)
         with self._database.read() as connection:
             rows = store.list_events(
-                connection, caller.agency_id, after=after, job_kinds=kinds, holder_id=caller.own_key_id, limit=limit
+                connection, caller.agency_id, after=after, job_kinds=kinds, about=about, limit=limit
             )
         return [cast("EventDocument", row._asdict()) for row in rows]
 

@@ -10,9 +10,12 @@ import sqlalchemy as sa
 
 from app.registry.blob_references import blob_references
 from app.registry.database import Database
+from app.registry.decodes import decodes
 from app.registry.engines import across_agencies
-from app.registry.jobs import UNFINISHED
-from app.registry.tables import decodes, jobs, markers, plan_markers, planned_markers
+from app.registry.jobs import UNFINISHED, jobs
+from app.registry.marker_rows import markers
+from app.registry.plan_features import planned_markers
+from app.registry.plan_states import plan_markers
 from app.services.access.audit import AuditLog
 from app.services.blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.services.ports import utc_now

@@ -24,8 +24,7 @@ from app.registry.bulk_load import large_load, load_rows
 from app.registry.column_types import new_id, row_of
 from app.registry.database import Database
 from app.registry.features import feature_text
-from app.registry.marker_rows import MarkerRow
-from app.registry.tables import markers
+from app.registry.marker_rows import MarkerRow, markers
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
 

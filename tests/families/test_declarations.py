@@ -10,7 +10,7 @@ import pytest
 
 from app.families import FAMILIES, FAMILY_NAMES
 from app.families.family import Family
-from app.registry.tables import markers
+from app.registry.marker_rows import markers
 
 ROOT = Path(__file__).parents[2]
 

@@ -31,7 +31,7 @@ from app.registry import jobs as store
 from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.jobs import JobKind, new_job
-from app.registry.tables import jobs as table
+from app.registry.jobs import jobs as table
 from app.services.jobs import Jobs, QueueName, RunningJob
 from app.settings import Settings
 from tests.brokers import find_broker, own_queues

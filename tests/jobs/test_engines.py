@@ -16,7 +16,7 @@ import sqlalchemy as sa
 from rosbags.typesys import Stores, get_typestore
 
 from app.registry.engines import across_agencies
-from app.registry.tables import marker_versions
+from app.registry.marker_rows import marker_versions
 from app.services.access.access import Scope
 from app.services.markers.artwork import IMMEDIATE_PLATES
 from app.settings import Settings

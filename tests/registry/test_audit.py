@@ -214,7 +214,7 @@ def test_what_was_changed_or_removed_is_named(registry: Registry, what: str) -> 
 def test_a_change_with_a_hash_that_fits_it_is_found(registry: Registry) -> None:
     """Whoever can compute a version's hash still has to change its entry, and every entry after it."""
     from app.registry.audit import version_sha256
-    from app.registry.tables import marker_versions as v
+    from app.registry.marker_rows import marker_versions as v
 
     marker_id = registry.marker_ids[0][0]
     with registry.database.write() as connection:

@@ -14,9 +14,9 @@ from app.registry import agencies, bulk_load
 from app.registry.bulk_load import Columns, JsonTexts, large_load, load_columns, load_rows
 from app.registry.column_types import new_id
 from app.registry.database import Database
+from app.registry.marker_rows import marker_versions, markers
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.spatial import box_around, fill_rtree
-from app.registry.tables import marker_versions, markers
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)
 TEXTS = ("plain", "tab\tand\nline", 'quote " and \\N', "Straße 日本", "")

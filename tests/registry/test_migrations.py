@@ -20,10 +20,10 @@ from app.registry.conditions import regraded
 from app.registry.database import Database
 from app.registry.features import feature_text
 from app.registry.history import list_versions
-from app.registry.marker_rows import MarkerRow
+from app.registry.marker_rows import MarkerRow, markers
 from app.registry.markers import MarkerFilter, list_magnets_in, list_markers
 from app.registry.spatial import Box
-from app.registry.tables import markers, metadata
+from app.registry.tables import metadata
 from app.services.access.audit import AuditLog
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)

@@ -18,9 +18,9 @@ from sqlalchemy import event
 from app.registry import agencies, nearest
 from app.registry.column_types import new_id
 from app.registry.database import Database
+from app.registry.marker_rows import markers
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.nearest import find_nearest_at_once, list_nearest
-from app.registry.tables import markers
 from app.services.markers.searches import area_of
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)

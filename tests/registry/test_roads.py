@@ -11,8 +11,9 @@ from pyproj import Geod
 
 from app.families.cerpm import NewCerpm
 from app.families.documents import PositionIn
+from app.registry.audit import audit_log
 from app.registry.database import Database
-from app.registry.tables import audit_log, marker_versions, markers
+from app.registry.marker_rows import marker_versions, markers
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
 from app.services.roads.documents import CalibrationInput, LinesInput

@@ -13,13 +13,14 @@ import pytest
 import sqlalchemy as sa
 
 from app.registry import agencies
+from app.registry.agencies import idempotency_keys
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.column_types import new_id, select_rows
 from app.registry.database import Database
 from app.registry.engines import across_agencies, acting_for, seeing_every_agency
+from app.registry.markers import codebooks as codebook_table
 from app.registry.resources import Resource
-from app.registry.tables import codebooks as codebook_table
-from app.registry.tables import idempotency_keys, metadata
+from app.registry.tables import metadata
 from app.settings import Settings
 from tests.api.markers.test_codebooks import DESIGN
 from tests.conftest import LiveServer

@@ -14,9 +14,9 @@ from pyproj import Geod
 from app.registry import agencies
 from app.registry.column_types import new_id
 from app.registry.database import Database
+from app.registry.marker_rows import markers
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.spatial import Box, box_around
-from app.registry.tables import markers
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
 GEOD = Geod(ellps="WGS84")

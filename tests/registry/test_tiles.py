@@ -17,7 +17,7 @@ from app.registry import agencies, audit
 from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.features import ON_ROAD, RETIRED, TILE_FIELDS
-from app.registry.tables import markers
+from app.registry.marker_rows import markers
 from app.registry.tiles import EXTENT, MAX_FEATURES, MAX_SINGLE, FeatureGrid, Tile, feature_tile, read_grid, write_layer
 from app.services.access.access import Caller, Scope
 from app.services.markers.features import MARKERS, Features

@@ -14,9 +14,12 @@ from app.registry import agencies, jobs
 from app.registry.blob_references import COLUMNS
 from app.registry.column_types import metadata, new_id
 from app.registry.database import Database
+from app.registry.decodes import decodes
 from app.registry.jobs import JobKind, new_job
-from app.registry.tables import damage_reports, decodes, markers
-from app.registry.work_tables import alignments, plans
+from app.registry.marker_rows import markers
+from app.registry.plan_states import plans
+from app.registry.plans import alignments
+from app.registry.public_pages import damage_reports
 from app.services.blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs, new_blob_key
 

@@ -16,7 +16,7 @@ from app.formats.format import SpooledFile
 from app.jobs.tasks import SameProcess
 from app.registry.database import Database
 from app.registry.engines import seeing_every_agency
-from app.registry.tables import markers
+from app.registry.marker_rows import markers
 from app.services.access.access import Access, Scope
 from app.services.ports import utc_now
 from app.services.surveys.import_report import ImportReport, import_input

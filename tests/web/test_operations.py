@@ -16,8 +16,7 @@ from playwright.sync_api import expect
 from app.registry import jobs as store
 from app.registry.column_types import new_id
 from app.registry.engines import across_agencies
-from app.registry.jobs import JobKind
-from app.registry.tables import jobs
+from app.registry.jobs import JobKind, jobs
 from app.services.access.access import Scope
 from tests.conftest import LiveServer
 from tests.web.browsing import PHONE, Watched, until

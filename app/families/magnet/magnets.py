@@ -54,10 +54,9 @@ from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedLineMagnet, PlannedMarker, PlannedTag
 from app.registry.column_types import new_id
 from app.registry.lines import MagnetLines
-from app.registry.marker_rows import MarkerRow
+from app.registry.marker_rows import MarkerRow, markers
 from app.registry.markers import CODEBOOKS, MagnetRow, book_of, list_magnets_in, replace_magnets
 from app.registry.spatial import Box, box_around
-from app.registry.tables import markers
 from app.roads.lane_line import LaneLine, bearing_deg
 
 # === Magnets of other markers near a layout: too near is a conflict, near is a check's warning.

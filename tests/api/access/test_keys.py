@@ -14,9 +14,10 @@ import pytest
 import sqlalchemy as sa
 
 from app.errors import InvalidParameter, NotAuthenticated
+from app.registry.agencies import api_keys
 from app.registry.audit import list_entries
 from app.registry.database import Database
-from app.registry.tables import api_keys, metadata
+from app.registry.tables import metadata
 from app.services.access.access import Access, Caller, Scope, check_key, new_key
 from app.services.access.keys import Keys, NewKey
 from tests.conftest import LiveServer

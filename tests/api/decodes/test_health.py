@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from app.geodesy import enu_from_heading, enu_from_wgs84, wgs84_from_enu
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
-from app.registry.tables import marker_health
+from app.registry.health import marker_health
 from app.sensors.camera import Camera
 from app.services.health.record import recompute_health
 from app.simulation.camera import render_plate_scene

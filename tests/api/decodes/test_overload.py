@@ -12,7 +12,7 @@ import pytest
 import sqlalchemy as sa
 
 from app.main import create_app
-from app.registry.tables import decodes
+from app.registry.decodes import decodes
 from app.settings import Settings
 from tests.api.decodes.conftest import post_frame
 from tests.conftest import ADMIN_KEY, LiveServer

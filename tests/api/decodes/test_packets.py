@@ -26,7 +26,7 @@ from app.encoders.cerpm import encode_message
 from app.errors import TooManyRequests
 from app.main import create_app
 from app.markers.cerpm import CerpmMessage
-from app.registry.tables import decodes, observations
+from app.registry.decodes import decodes, observations
 from app.sensors.pose_track import ReceivedPacket
 from app.services.access.access import Scope
 from app.services.decodes.recordings import InvalidTagLimit

@@ -8,8 +8,8 @@ import sqlalchemy as sa
 
 from app.health import Fault, Verdict
 from app.registry.column_types import new_id
+from app.registry.decodes import decodes
 from app.registry.health import ItemFilter, list_items
-from app.registry.tables import decodes
 from app.services.health.maintenance import ItemUpload, Suspicion, open_items
 
 AT = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)

@@ -19,8 +19,10 @@ from starlette.routing import Mount
 from app.api.http.permissions import EVERYBODY, PERMISSIONS, PUBLIC, Permissions
 from app.formats.format import SpooledFile
 from app.main import create_app
+from app.registry.agencies import api_keys
 from app.registry.jobs import JobKind, add_job, new_job
-from app.registry.tables import api_keys, calibrations, reprocessings
+from app.registry.reprocessings import reprocessings
+from app.registry.vehicles import calibrations
 from app.services.access.access import AGENCY_SCOPES, Scope
 from app.services.public_pages.reports import SentReport
 from app.settings import Settings

@@ -10,8 +10,8 @@ import pytest
 import sqlalchemy as sa
 
 from app.errors import NotAuthenticated
+from app.registry.agencies import api_keys
 from app.registry.database import Database
-from app.registry.tables import api_keys
 from app.services.access.access import Access, Scope
 
 pytestmark = pytest.mark.both_databases

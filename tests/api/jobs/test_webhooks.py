@@ -28,8 +28,8 @@ from cryptography.x509.oid import NameOID
 from app.errors import InvalidParameter
 from app.registry.engines import across_agencies
 from app.registry.jobs import JobKind
-from app.registry.work_tables import webhook_deliveries
-from app.registry.work_tables import webhooks as webhook_table
+from app.registry.webhooks import webhook_deliveries
+from app.registry.webhooks import webhooks as webhook_table
 from app.services import webhooks as delivery_module
 from app.services.access.access import Scope
 from app.services.webhooks import GIVE_UP_AFTER, LEASE, WebhookDelivery, is_wanted, signed_headers

@@ -14,8 +14,8 @@ import sqlalchemy as sa
 from app.errors import Unavailable
 from app.main import create_app
 from app.planning.proof import prove
+from app.registry.agencies import agencies
 from app.registry.jobs import JobKind
-from app.registry.tables import agencies
 from app.services.plans.tasks import ProveUnitTask, WriteProofTask
 from app.settings import Settings
 from tests.api.plans.test_plans import road, send_road

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from PIL import Image
 
 from app.registry.engines import across_agencies
-from app.registry.tables import damage_report_contacts
+from app.registry.public_pages import damage_report_contacts
 from app.registry.webhooks import list_events
 from app.services.access.access import Scope
 from app.services.public_pages import reports as service

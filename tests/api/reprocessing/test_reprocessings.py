@@ -16,9 +16,10 @@ import sqlalchemy as sa
 from app.demo.cerpms import build_lane
 from app.errors import UnreadableUpload
 from app.main import create_app
+from app.registry.decodes import decodes, observations
 from app.registry.engines import across_agencies
-from app.registry.tables import decodes, observations, reprocessed_decodes
-from app.registry.tables import jobs as jobs_table
+from app.registry.jobs import jobs as jobs_table
+from app.registry.reprocessings import reprocessed_decodes
 from app.services import reprocessing as module
 from app.services.access.access import Scope
 from app.services.reprocessing import compare_results

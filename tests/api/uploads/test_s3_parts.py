@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from moto.server import ThreadedMotoServer
 
 from app.main import create_app
-from app.registry.tables import decodes
+from app.registry.decodes import decodes
 from app.settings import Settings
 from tests.api.uploads.conftest import TUS, problem_of, zip_of_frames
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer

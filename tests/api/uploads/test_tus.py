@@ -17,8 +17,8 @@ import sqlalchemy as sa
 from tusclient.client import TusClient
 
 from app.formats.format import SpooledFile
-from app.registry.tables import decodes, uploads
-from app.registry.work_tables import stored_bytes, upload_parts
+from app.registry.decodes import decodes
+from app.registry.uploads import stored_bytes, upload_parts, uploads
 from app.services.access.access import Scope
 from tests.api.uploads.conftest import PART, TUS, append, offset_of, problem_of, start, zip_of_frames
 from tests.conftest import LiveServer

@@ -27,7 +27,7 @@ from app.registry.blob_references import blob_references
 from app.registry.database import Database, head_revision
 from app.registry.dumps import copy_sqlite
 from app.registry.engines import across_agencies
-from app.registry.tables import jobs
+from app.registry.jobs import jobs
 from app.services.backups import BackupOptions, Backups, Restores, verify_backup
 from app.services.ports import utc_now
 from app.settings import Settings
