@@ -23,9 +23,7 @@ from xml.sax.saxutils import escape
 
 from fontTools.ttLib import TTFont
 
-# === The typeface of everything that is built: Bitstream Vera, read from the installed reportlab.
-#
-# Its licence allows embedding and redistribution.
+# === The typeface of everything that is built: Bitstream Vera, whose licence allows embedding and redistribution.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +52,7 @@ class Typeface:
 @lru_cache(maxsize=2)
 def load_typeface(*, bold: bool = False) -> Typeface:
     """One weight, read once."""
-    content = (resources.files("reportlab") / "fonts" / ("VeraBd.ttf" if bold else "Vera.ttf")).read_bytes()
+    content = resources.files("app.encoders").joinpath(f"data/{'VeraBd' if bold else 'Vera'}.ttf").read_bytes()
     font = TTFont(BytesIO(content), lazy=False)
     return Typeface(content, font, font.getGlyphSet(), font.getBestCmap())
 

@@ -66,9 +66,13 @@ def check_accuracy(horizontal_rmse_m: float | None, vertical_rmse_m: float | Non
 
 def _check_zeros(survey: GeoreferencedSurvey) -> Iterator[Fault]:
     zero = (survey.table.first == 0) | (survey.table.second == 0)
+    yield from (zero_coordinate(int(row) + 1) for row in np.flatnonzero(zero))
+
+
+def zero_coordinate(row: int | None) -> Fault:
+    """The fault of a row, or of a single position, that has a coordinate of 0."""
     cure = "fill it in or leave it out"
-    for row in np.flatnonzero(zero):
-        yield Fault(int(row) + 1, "position", "zero_coordinate", "a coordinate is exactly 0", cure)
+    return Fault(row, "position", "zero_coordinate", "a coordinate is exactly 0", cure)
 
 
 def _check_rounding(survey: GeoreferencedSurvey) -> list[Fault]:
@@ -241,11 +245,21 @@ def check_heights(survey: GeoreferencedSurvey) -> Iterator[Fault]:
     outside = ~no_data & ((height < _HEIGHTS_M[0]) | (height > _HEIGHTS_M[1]))
     zero = (written == 0) & (abs(float(np.nanmedian(height))) > 5)
     for row in np.flatnonzero(no_data | outside | zero):
-        code = "height_out_of_range" if outside[row] else "no_height"
-        message = f"the height is {written[row]:g} {survey.table.height_unit}"
-        yield Fault(int(row) + 1, "height", code, message, "leave the cell empty where there is no height")
+        yield _no_height(int(row) + 1, written[row], survey.table.height_unit, is_outside=bool(outside[row]))
     usable = np.flatnonzero(np.isfinite(height) & survey.placed.placed & ~(no_data | outside | zero))
     yield from _check_steps(survey, usable)
+
+
+def check_height(height_m: float) -> list[Fault]:
+    """The fault of a single position's height, if it has one."""
+    no_data, is_outside = height_m in _NO_DATA, not _HEIGHTS_M[0] <= height_m <= _HEIGHTS_M[1]
+    return [_no_height(None, height_m, "m", is_outside=is_outside and not no_data)] if no_data or is_outside else []
+
+
+def _no_height(row: int | None, written: float, unit: str, *, is_outside: bool) -> Fault:
+    code = "height_out_of_range" if is_outside else "no_height"
+    message = f"the height is {written:g} {unit}"
+    return Fault(row, "height", code, message, "leave the cell empty where there is no height")
 
 
 def _check_steps(survey: GeoreferencedSurvey, rows: npt.NDArray[np.intp]) -> Iterator[Fault]:

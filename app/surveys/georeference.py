@@ -255,13 +255,14 @@ class GeoreferencedSurvey:
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """Another reading of the coordinates, and the median position that it gives."""
+    """Another reading of coordinates, and the median position that it gives."""
 
     code: str
     proposal: str
-    changes: tuple[Change, ...]
+    crs: str
     lon_deg: float
     lat_deg: float
+    changes: tuple[Change, ...] = ()  # what has to be declared for it; nothing where the file has to be changed
 
 
 def georeference_survey(table: SurveyTable, declaration: ImportDeclaration, accuracy_m: float) -> GeoreferencedSurvey:
@@ -321,29 +322,28 @@ def list_alternatives(table: SurveyTable, declaration: ImportDeclaration) -> lis
     """Readings of the same numbers that differ from the declaration in one respect: axes, sign, unit, zone."""
     finite = np.flatnonzero(np.isfinite(table.first) & np.isfinite(table.second))
     rows = finite[:: max(len(finite) // _SAMPLE, 1)]
-    found = []
-    for code, proposal, first, second, crs in _readings(table, table.first[rows], table.second[rows]):
-        changes = _changes_of(code, proposal, crs, table, declaration)
+    readings = list_readings(table.first[rows], table.second[rows], table.crs, table.unit, declaration.realization)
+    return [replace(reading, changes=_changes_of(reading, table, declaration)) for reading in readings]
+
+
+def list_readings(first: Floats, second: Floats, crs: str, unit: str, realization: str | None) -> Iterator[Alternative]:
+    """Readings of coordinates in a CRS and a unit that differ in one respect: axes, sign, unit, zone."""
+    no_heights = np.full(len(first), np.nan)
+    for code, proposal, other_first, other_second, other_crs in _readings(first, second, crs, unit):
         try:
-            placed = place_positions(
-                first, second, np.full(len(rows), np.nan), crs=crs, realization=declaration.realization
-            )
+            placed = place_positions(other_first, other_second, no_heights, crs=other_crs, realization=realization)
         except WaymarkError:
             continue
-        if len(rows) and placed.placed.mean() > 0.5:
-            found.append(Alternative(code, proposal, changes, *median_deg(placed)))
-    return found
+        if len(first) and placed.placed.mean() > 0.5:
+            yield Alternative(code, proposal, other_crs, *median_deg(placed))
 
 
-def _changes_of(
-    code: str, proposal: str, crs: str, table: SurveyTable, declaration: ImportDeclaration
-) -> tuple[Change, ...]:
-    """What has to be declared for another reading; nothing where the file has to be changed."""
-    if code == "swapped_axes":
+def _changes_of(reading: Alternative, table: SurveyTable, declaration: ImportDeclaration) -> tuple[Change, ...]:
+    if reading.code == "swapped_axes":
         return _swapped(table, declaration)
-    if code == "wrong_zone":
-        return (Change("crs", crs),)
-    unit = proposal.removeprefix(_DECLARE_UNIT)
+    if reading.code == "wrong_zone":
+        return (Change("crs", reading.crs),)
+    unit = reading.proposal.removeprefix(_DECLARE_UNIT)
     return (Change("unit", unit),) if unit in METRES else ()
 
 
@@ -360,18 +360,18 @@ def _swapped(table: SurveyTable, declaration: ImportDeclaration) -> tuple[Change
     return Change(f"columns.{roles[0]}", columns[1]), Change(f"columns.{roles[1]}", columns[0])
 
 
-def _readings(table: SurveyTable, first: Floats, second: Floats) -> Iterator[tuple[str, str, Floats, Floats, str]]:
+def _readings(first: Floats, second: Floats, crs: str, unit: str) -> Iterator[tuple[str, str, Floats, Floats, str]]:
     """Code, proposal, and the coordinates with the CRS of each other reading."""
-    crs = table.crs
-    factor = unit_factor(table.unit, reference_system(crs))
+    system = reference_system(crs)
+    factor = unit_factor(unit, system)
     first, second = first * factor, second * factor
-    names = ("easting", "northing") if table.projected else ("lon_deg", "lat_deg")
+    names = ("easting", "northing") if system.is_projected else ("lon_deg", "lat_deg")
     swapped = _without_zone(second, crs)
     yield "swapped_axes", f"swap the columns of {names[0]} and {names[1]}", swapped, first, crs
     yield "wrong_sign", f"give {names[0]} the other sign", -first, second, crs
     yield "wrong_sign", f"give {names[1]} the other sign", first, -second, crs
     yield "wrong_sign", "give both coordinates the other sign", -first, -second, crs
-    if not table.projected:
+    if not system.is_projected:
         yield "degrees_minutes", "write ddmm.mmmm as decimal degrees", _from_dm(first), _from_dm(second), crs
         yield "degrees_minutes", "write D.MMSS as decimal degrees", _from_dms(first), _from_dms(second), crs
         for power in (6, 7):
@@ -380,10 +380,10 @@ def _readings(table: SurveyTable, first: Floats, second: Floats) -> Iterator[tup
         return
     for factor, proposal in _THOUSANDS:
         yield "wrong_unit", proposal, first * factor, second * factor, crs
-    for unit in METRES:
-        if unit != table.unit:
-            change = METRES[unit] / METRES[table.unit]
-            yield "wrong_unit", f"{_DECLARE_UNIT}{unit}", first * change, second * change, crs
+    for other_unit in METRES:
+        if other_unit != unit:
+            change = METRES[other_unit] / METRES[unit]
+            yield "wrong_unit", f"{_DECLARE_UNIT}{other_unit}", first * change, second * change, crs
     yield from ((code, proposal, first, second, other) for code, proposal, other in _sibling_zones(crs))
 
 

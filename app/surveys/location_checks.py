@@ -13,8 +13,15 @@ import numpy as np
 
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.table import Change, Fault, Floats, Severity, warn
-from app.surveys.consistency_checks import nearest_of
-from app.surveys.georeference import Alternative, GeoreferencedSurvey, east_north_m, list_alternatives
+from app.geodesy import reference_system
+from app.surveys.consistency_checks import check_height, nearest_of, zero_coordinate
+from app.surveys.georeference import (
+    Alternative,
+    GeoreferencedSurvey,
+    east_north_m,
+    list_alternatives,
+    list_readings,
+)
 
 HasMarkersNear = Callable[[float, float], bool]
 """Whether markers are registered within some kilometres of a longitude and latitude."""
@@ -103,11 +110,7 @@ def _check_whole(
         return [_no_position(survey, declaration, is_known)]
     hit = _first_hit(survey, declaration, is_known)
     if hit is not None:
-        return [
-            _whole(
-                hit, "no registered marker is near, but another reading of the coordinates is near many", hit.code, ""
-            )
-        ]
+        return [_elsewhere(hit, _NEAR_OTHERWISE)]
     return [
         warn(
             None, "position", "place_unchecked",
@@ -127,8 +130,14 @@ def _first_hit(survey: GeoreferencedSurvey, declaration: ImportDeclaration, fits
 
 
 def _whole(hit: Alternative | None, message: str, code: str, cure: str) -> Fault:
-    if hit is None:
-        return Fault(None, "position", code, message, cure)
+    return Fault(None, "position", code, message, cure) if hit is None else _elsewhere(hit, message)
+
+
+_NEAR_OTHERWISE = "no registered marker is near, but another reading of the coordinates is near many"
+
+
+def _elsewhere(hit: Alternative, message: str) -> Fault:
+    """Coordinates that fit when they are read in another way."""
     proposal = f"{hit.proposal}; the survey then fits"
     return Fault(None, "position", hit.code, message, proposal, Severity.REFUSED, hit.changes)
 
@@ -190,14 +199,14 @@ def measured_changes(survey: GeoreferencedSurvey) -> tuple[Change, ...]:
 def _check_already_there(
     rows: np.ndarray[tuple[int], np.dtype[np.intp]], distance_m: Floats, changes: tuple[Change, ...]
 ) -> Iterator[Fault]:
-    return (
-        warn(
-            int(rows[k]) + 1, "position", "marker_already_there",
-            f"a registered marker lies {distance_m[k]:.2f} m from here",
-            "declare compare if the survey measures registered markers", changes,
-        )
-        for k in np.flatnonzero(distance_m <= _ALREADY_THERE_M)
-    )  # fmt: skip
+    already_there = np.flatnonzero(distance_m <= _ALREADY_THERE_M)
+    return (_already_there(int(rows[k]) + 1, distance_m[k], changes) for k in already_there)
+
+
+def _already_there(row: int | None, distance_m: float, changes: tuple[Change, ...] = ()) -> Fault:
+    message = f"a registered marker lies {distance_m:.2f} m from here"
+    proposal = "declare compare if the survey measures registered markers"
+    return warn(row, "position", "marker_already_there", message, proposal, changes)
 
 
 def _check_beside(points: Floats, nearest: Floats, distance_m: Floats) -> list[Fault]:
@@ -258,3 +267,49 @@ def _height_cure(
         if abs(ratio / factor - 1) < 0.05:
             return f"the heights seem to be in {unit}: declare height_unit", (Change("height_unit", declared),)
     return "check vertical_datum: heights above the geoid and above the ellipsoid differ by up to 100 m", ()
+
+
+# === The position of a single marker, which is registered without a survey.
+
+
+@dataclass(frozen=True, slots=True)
+class SinglePosition:
+    """A position, and the coordinates that it was computed from."""
+
+    lon_deg: float
+    lat_deg: float
+    first: float  # longitude [deg] or easting [m] in `crs`
+    second: float  # latitude [deg] or northing [m]
+    height_m: float | None
+    crs: str
+    realization: str | None
+
+
+def check_single_position(
+    position: SinglePosition, lon_deg: Floats, lat_deg: Floats, is_known: HasMarkersNear
+) -> Iterator[Fault]:
+    """Faults of a position: what the checks of surveys can find in one row alone.
+
+    Parameters
+    ----------
+    position : SinglePosition
+    lon_deg, lat_deg : ndarray, shape (M,)
+        Registered markers around it. [deg]
+    is_known : callable
+    """
+    if position.first == 0 or position.second == 0:
+        yield zero_coordinate(None)
+    if position.height_m is not None:
+        yield from check_height(position.height_m)
+    here = position.lon_deg, position.lat_deg
+    if len(lon_deg):
+        nearest_m = float(np.hypot(*east_north_m(lon_deg, lat_deg, here)).min())
+        if nearest_m <= _ALREADY_THERE_M:
+            yield _already_there(None, nearest_m)
+    elif not is_known(*here):
+        first, second = np.array([position.first], dtype=np.float64), np.array([position.second], dtype=np.float64)
+        unit = "m" if reference_system(position.crs).is_projected else "deg"
+        readings = list_readings(first, second, position.crs, unit, position.realization)
+        hit = next((reading for reading in readings if is_known(reading.lon_deg, reading.lat_deg)), None)
+        if hit is not None:
+            yield _elsewhere(hit, _NEAR_OTHERWISE)

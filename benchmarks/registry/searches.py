@@ -21,7 +21,7 @@ from app.registry.spatial import Area, Box
 from app.services.access.access import Access, Caller
 from app.services.decodes.context import CoarsePosition
 from app.services.decodes.matching import find_nearby_markers, match_reading
-from app.services.markers.features import Features
+from app.services.markers.features import MARKERS, Features
 from app.services.markers.searches import Searches
 from benchmarks.registry.fill import CERPM_EVERY, PER_ROAD, SPACING_M, Network
 from benchmarks.registry.serving import BOX_FEATURES, PAGE, Registry
@@ -107,7 +107,7 @@ def _searches(database: Database, caller: Caller, network: Network) -> dict[str,
     areas = [_diamond(box) for box in boxes]
 
     def box(k: int, _lon: float, _lat: float) -> object:
-        return features.page(caller, FeatureFilter(box=boxes[k % len(boxes)]), limit=PAGE)
+        return features.page(caller, MARKERS, FeatureFilter(box=boxes[k % len(boxes)]), limit=PAGE)
 
     def near(_k: int, lon: float, lat: float) -> object:
         return searches.page(caller, MarkerFilter(near=(lon, lat, RADIUS_M)), limit=100)

@@ -61,8 +61,8 @@ from app.settings import Settings
 app = create_app(Settings(data_dir="."))
 app.state.database.migrate()
 late = {"numba", "app.jobs.tasks", "app.decoders.plate.reader", "scipy.stats", "scipy.signal", "scipy.optimize",
-    "scipy.spatial", "pyogrio", "pyarrow", "ezdxf", "reportlab", "celery", "boto3", "psycopg", "jwt", "httpx", "gpxpy",
-    "pynmeagps", "av", "mcap", "rosbags", "typer", "alembic"}
+    "scipy.spatial", "pyogrio", "pyarrow", "ezdxf", "celery", "boto3", "psycopg", "jwt", "httpx", "gpxpy",
+    "jinja2", "pynmeagps", "av", "mcap", "rosbags", "typer", "alembic"}
 print(late & set(sys.modules), [route.path for route in app.routes if "dependant" in vars(route)])
 """
     for loaded in ("{'alembic'} []", "set() []"):

@@ -61,6 +61,7 @@ def test_the_wheel_runs_in_an_empty_folder(tmp_path: Path) -> None:
     assert wheel.name.startswith(f"waymark_roads-{__version__}-")
     assert {name.split("/")[0] for name in names} == {"app", f"waymark_roads-{__version__}.dist-info"}
     assert {"app/py.typed", "app/migrations/env.py", "app/static/index.html"} <= set(names)
+    assert {str(path) for path in context_files() if path.parts[0] == "app"} <= set(names)
     for folder in ("static", "migrations"):
         assert {f"app/{path}" for path in context_files() if path.parts[0] == folder} <= set(names)
     programs, empty = install(wheel, tmp_path / "environment"), tmp_path / "empty"

@@ -66,17 +66,19 @@ def list_items(
     collection: CollectionOf, query: ItemsQueryOf, base: BaseUrl, caller: Caller, features: FeaturesService
 ) -> Response:
     """A page of features, or how many there are."""
-    count, read = features.count, features.page
-    if collection.lines is not None:
-        count = partial(features.count_lines, lines=collection.lines)
-        read = partial(features.lines, lines=collection.lines)
     if query.hits:
-        hits = _hits(count(caller, filtered=query.filtered))
+        hits = _hits(features.count(caller, collection, query.filtered))
         if query.is_page:
             return html_response(items_page(base, collection, query, hits, None))
         return answer(hits, GEOJSON)
-    page = read(
-        caller, filtered=query.filtered, after=query.after, limit=query.limit, crs=query.crs, counted=query.counted
+    page = features.page(
+        caller,
+        collection,
+        query.filtered,
+        after=query.after,
+        limit=query.limit,
+        crs=query.crs,
+        counted=query.counted,
     )
     document: FeaturePage = {
         "type": "FeatureCollection",
@@ -102,10 +104,7 @@ def get_item(
     features: FeaturesService,
 ) -> Response:
     """One feature."""
-    if collection.lines is not None:
-        feature = features.get_line(caller, collection, collection.lines, feature_id, query.crs)
-    else:
-        feature = features.get(caller, collection, feature_id, query.crs)
+    feature = features.get(caller, collection, feature_id, query.crs)
     url = f"{base}/collections/{collection.id}"
     document: Feature = {
         "type": "Feature",

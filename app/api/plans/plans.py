@@ -212,9 +212,10 @@ def get_plan(plan_id: PlanId, caller: Caller, plans: Service, if_none_match: IfN
 
 
 @router.patch("/{plan_id}", responses=document_response(PlanDocument, 404, 409, 412, 428))
-def patch_plan(plan_id: PlanId, wanted: PlanPatch, caller: Caller, plans: Service, version: Version) -> Response:
+def patch_plan(plan_id: PlanId, patch: PlanPatch, caller: Caller, plans: Service, version: Version) -> Response:
     """Rename a plan, or place and check it again by other rules; its proof and its approval are then gone."""
-    return versioned_response(plans.change(caller, plan_id, wanted.change(), version))
+    changed = plans.change(caller, plan_id, version, name=patch.name, rules=patch.rules, reason=patch.reason)
+    return versioned_response(changed)
 
 
 @router.get("/{plan_id}/versions", responses=document_response(PlanVersionPage, 404))

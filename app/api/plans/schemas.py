@@ -11,7 +11,6 @@ from app.families.documents import Flag, Identifier, Number, Text, VerticalDatum
 from app.formats.alignments.read import RoadLanes
 from app.planning.alignment import AlignmentDeclaration
 from app.planning.proof import ProofTerms
-from app.services.plans.plans import PlanChange
 
 Name = Annotated[Text, Field(min_length=1, max_length=80)]
 MAX_RULES_TEXT = 50_000
@@ -133,12 +132,6 @@ class PlanPatch(_Body):
     name: Name | None = None
     rules: dict[str, Any] | None = None
     reason: Annotated[Text | None, Field(max_length=500)] = None
-
-    def change(self) -> PlanChange:
-        """What the request names."""
-        named = self.model_fields_set - {"reason"}
-        values = {name: value for name, value in self.model_dump(include=named).items() if value is not None}
-        return PlanChange(values, self.reason)
 
 
 class ProofIn(ProofTerms):

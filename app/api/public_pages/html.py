@@ -1,23 +1,20 @@
-"""The public pages as HTML: no script and no inline style, so that the content security policy can refuse both.
-
-Whatever is inserted passes through `escape`; the texts do, too.
-"""
+"""The public pages as HTML: no script and no inline style, so that the content security policy can refuse both."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 
 from fastapi import Response
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from app.api.public_pages.texts import LANGUAGES, Texts, is_public_page, texts_for, wants_json
-from app.services.public_pages.pages import PublicMarker, ReportKind
+from app.api.templates import render_page
+from app.services.public_pages.pages import PublicMarker
 
 MAX_TEXT = 1000
-"""Characters of a description. Source: chosen by hand."""
+"""Characters of a description."""
 MAX_EMAIL = 254
 """Characters of an address (RFC 5321, section 4.5.3.1.3, without the angle brackets)."""
 
@@ -27,11 +24,10 @@ class FormState:
     """A form as it is shown."""
 
     token: str
-    # `photo_mb`, `contact_days`: limits that the hints name. [MB, d]
-    photo_mb: int
-    contact_days: int
+    photo_mb: int  # size that a photo may have
+    contact_days: int  # time until an e-mail address is deleted
     values: Mapping[str, str]  # what was typed before, by field
-    faults: Mapping[str, str]  # what is wrong, by field; the key of a text and what it names
+    faults: Mapping[str, str]  # what is wrong, by field
     had_photo: bool = False
 
 
@@ -45,32 +41,30 @@ def marker_page(texts: Texts, marker: PublicMarker, form: FormState | None, *, u
     up : str
         Relative address of the page's folder, from where it is shown.
     """
-    facts = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in _facts(texts, marker)
-    )
     title = texts.marker if marker.agency is None else f"{texts.marker} – {marker.agency}"
-    report = "" if form is None else _report(texts, marker, form, up)
-    summary = "" if form is None else _summary(texts, form)
     if form is not None and form.faults:
         title = f"{texts.error_prefix}: {title}"
-    body = f'{summary}<h1>{escape(texts.marker)}</h1>\n<dl class="facts">{facts}</dl>\n{report}'
-    return _page(texts, title, body, here=f"{up}{marker.id}", up=up)
+    facts = _facts(texts, marker)
+    values = {"marker": marker, "facts": facts, "form": form, "max_text": MAX_TEXT, "max_email": MAX_EMAIL}
+    return _page("marker.html", texts, title, here=f"{up}{marker.id}", up=up, **values)
 
 
 def thanks_page(texts: Texts, marker: PublicMarker) -> str:
     """The page after a report was received."""
-    back = f"../{marker.id}?lang={texts.language}"
-    body = (
-        f"<h1>{escape(texts.thanks)}</h1>\n<p>{escape(texts.thanks_text)}</p>\n"
-        f'<p><a class="button" href="{escape(back)}">{escape(texts.back)}</a></p>'
-    )
-    return _page(texts, texts.thanks, body, here="thanks", up="../")
+    return _page("thanks.html", texts, texts.thanks, here="thanks", up="../", marker=marker)
 
 
 def problem_page(texts: Texts, status: int, depth: int) -> str:
     """The page for an error: the same for every cause with this status."""
     title, text = texts.problems.get(status, texts.problems[0])
-    return _page(texts, title, f"<h1>{escape(title)}</h1>\n<p>{escape(text)}</p>", here="", up="../" * depth)
+    return _page("problem.html", texts, title, here="", up="../" * depth, text=text)
+
+
+def _page(template: str, texts: Texts, title: str, *, here: str, up: str, **values: object) -> str:
+    others = [other for other in LANGUAGES.values() if other is not texts]
+    return render_page(
+        f"public/{template}", texts=texts, title=title, other_languages=others, here=here, up=up, **values
+    )
 
 
 def _facts(texts: Texts, marker: PublicMarker) -> Sequence[tuple[str, str]]:
@@ -84,147 +78,6 @@ def _facts(texts: Texts, marker: PublicMarker) -> Sequence[tuple[str, str]]:
         (texts.measure, measure),
     )
     return [(name, value) for name, value in found if value is not None]
-
-
-def _page(texts: Texts, title: str, body: str, *, here: str, up: str) -> str:
-    others = " ".join(
-        f'<a href="{escape(here)}?lang={other.language}" lang="{other.language}" hreflang="{other.language}">'
-        f"{escape(other.name)}</a>"
-        for other in LANGUAGES.values()
-        if other is not texts
-    )
-    static = f"{up}../static"
-    return f"""<!doctype html>
-<html lang="{texts.language}">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta name="robots" content="noindex">
-<title>{escape(title)}</title>
-<link rel="icon" href="{static}/favicon.svg" type="image/svg+xml">
-<link rel="stylesheet" href="{static}/public.css">
-</head>
-<body>
-<header><span class="brand">Waymark</span> <nav>{others}</nav></header>
-<main>
-{body}
-</main>
-</body>
-</html>
-"""
-
-
-# --- the form -----------------------------------------------------------------------------------------------------
-
-
-def _report(texts: Texts, marker: PublicMarker, form: FormState, up: str) -> str:
-    action = f"{up}{marker.id}/reports?lang={texts.language}"
-    parts = (
-        _kinds(texts, form),
-        _text(texts, form),
-        _photo(texts, form),
-        _email(texts, form),
-        _honeypot(texts, form),
-    )
-    return f"""<section aria-labelledby="report">
-<h2 id="report">{escape(texts.report)}</h2>
-<p>{escape(texts.report_intro)}</p>
-<form method="post" action="{escape(action)}" enctype="multipart/form-data" novalidate>
-<input type="hidden" name="token" value="{escape(form.token)}">
-{"".join(parts)}
-<p><button type="submit">{escape(texts.send)}</button></p>
-</form>
-</section>"""
-
-
-def _summary(texts: Texts, form: FormState) -> str:
-    """What is wrong, before everything else; it gets the focus."""
-    if not form.faults:
-        return ""
-    places = {"kind": "kind-damaged", "token": "send"}
-    lines = "".join(
-        f"<li>{escape(text)}</li>"
-        if field == "token"
-        else f'<li><a href="#{places.get(field, field)}">{escape(text)}</a></li>'
-        for field, text in form.faults.items()
-    )
-    again = f"<p>{escape(texts.photo_again)}</p>" if form.had_photo else ""
-    return (
-        f'<div class="problem" role="alert" tabindex="-1" autofocus><h2>{escape(texts.errors_title)}</h2>'
-        f"<ul>{lines}</ul>{again}</div>\n"
-    )
-
-
-def _kinds(texts: Texts, form: FormState) -> str:
-    choices = "".join(_choice(kind, text, form) for kind, text in texts.kinds.items())
-    described = ' aria-describedby="kind-fault"' if "kind" in form.faults else ""
-    required = f'<span class="soft">({escape(texts.required)})</span>'
-    return (
-        f"<fieldset{described}><legend>{escape(texts.kind)} {required}</legend>"
-        f"{_fault('kind', form)}{choices}</fieldset>"
-    )
-
-
-def _choice(kind: ReportKind, text: str, form: FormState) -> str:
-    checked = " checked" if form.values.get("kind") == kind else ""
-    return (
-        f'<label class="choice"><input type="radio" id="kind-{kind}" name="kind" value="{kind}" required{checked}> '
-        f"<span>{escape(text)}</span></label>"
-    )
-
-
-def _text(texts: Texts, form: FormState) -> str:
-    hint = texts.text_hint.format(limit=MAX_TEXT)
-    area = (
-        f'<textarea id="text" name="text" rows="4" maxlength="{MAX_TEXT}"{_described("text", form)}>\n'
-        f"{escape(form.values.get('text', ''))}</textarea>"
-    )
-    return _field(texts, form, "text", texts.text, hint, area)
-
-
-def _photo(texts: Texts, form: FormState) -> str:
-    hint = texts.photo_hint.format(limit=form.photo_mb)
-    choose = f'<input type="file" id="photo" name="photo" accept="image/jpeg,image/png"{_described("photo", form)}>'
-    return _field(texts, form, "photo", texts.photo, hint, choose)
-
-
-def _email(texts: Texts, form: FormState) -> str:
-    hint = texts.email_hint.format(days=form.contact_days)
-    line = (
-        f'<input type="email" id="email" name="email" autocomplete="email" maxlength="{MAX_EMAIL}"'
-        f' value="{escape(form.values.get("email", ""))}"{_described("email", form)}>'
-    )
-    return _field(texts, form, "email", texts.email, hint, line)
-
-
-def _honeypot(texts: Texts, form: FormState) -> str:
-    """A field that only programs fill in: it is neither shown nor reached by the keyboard, unless it was filled in."""
-    hidden = "" if "website" in form.faults else ' class="trap" aria-hidden="true"'
-    value = escape(form.values.get("website", ""))
-    return (
-        f'<div{hidden}><label for="website">{escape(texts.leave_empty)}</label>{_fault("website", form)}'
-        f'<input type="text" id="website" name="website" tabindex="-1" autocomplete="off" value="{value}"></div>'
-    )
-
-
-def _field(texts: Texts, form: FormState, name: str, label: str, hint: str, control: str) -> str:
-    return (
-        f'<div class="field"><label for="{name}">{escape(label)} <span class="soft">({escape(texts.optional)})</span>'
-        f'</label><p class="soft" id="{name}-hint">{escape(hint)}</p>{_fault(name, form)}{control}</div>'
-    )
-
-
-def _described(name: str, form: FormState) -> str:
-    if name in form.faults:
-        return f' aria-invalid="true" aria-describedby="{name}-hint {name}-fault"'
-    return f' aria-describedby="{name}-hint"'
-
-
-def _fault(name: str, form: FormState) -> str:
-    if name not in form.faults:
-        return ""
-    return f'<p class="fault" id="{name}-fault">{escape(form.faults[name])}</p>'
 
 
 # === What all responses to requests for public pages have in common; problems are pages there, too.

@@ -1,4 +1,7 @@
-"""What GIS clients read: collections of GeoJSON features. Built from rows by hand: every map view asks."""
+"""What GIS clients read: collections of GeoJSON features, and vector tiles of them.
+
+The features of points are stored as text, and a page of them joins the texts: every map view asks for one.
+"""
 
 from __future__ import annotations
 
@@ -74,14 +77,7 @@ class FeatureCrs(StrEnum):
 STORAGE_CRS = FeatureCrs.CRS84
 
 
-# === What GIS clients read.
-
-
-_KEPT_FOR, _KEPT_UNCHANGED_FOR = timedelta(seconds=60), timedelta(hours=1)
-_MAX_EXTENTS = 4096
-_MAX_GRIDS = 64  # of some MB
-Answer = TypeVar("Answer")
-Kept = TypeVar("Kept")
+# === Collections: what clients list as layers.
 
 
 class LineReader(Protocol):
@@ -126,10 +122,7 @@ class MarkerLines:
 
 @dataclass(frozen=True, slots=True)
 class Collection:
-    """A set of features that clients list as a layer: points of a table, or lines of a reader.
-
-    `is_audited`: each change of them has an entry in the audit log.
-    """
+    """A set of features that clients list as a layer: points of a table, or lines of a reader."""
 
     id: str
     title: str
@@ -140,7 +133,7 @@ class Collection:
     filters: tuple[str, ...] = tuple(field.name for field in FIELDS if field.kind != "date-time")
     table: FeatureTable = ON_ROAD
     lines: LineReader | None = None
-    is_audited: bool = False
+    is_audited: bool = False  # each change of them has an entry in the audit log
 
     @property
     def has_tiles(self) -> bool:
@@ -207,18 +200,6 @@ COLLECTIONS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Page:
-    """A page of features as JSON, how many it has, the id to continue after if there are more, and how many match if
-    that is known.
-    """
-
-    features: orjson.Fragment
-    returned: int
-    after: str | None
-    matched: int | None
-
-
 def get_collection(collection_id: str) -> Collection:
     """The collection with an id.
 
@@ -231,6 +212,15 @@ def get_collection(collection_id: str) -> Collection:
     if found is None:
         raise NotFound("there is no such collection", field="collectionId", limit=", ".join(COLLECTIONS))
     return found
+
+
+# === What takes a pass over all features of an agency: kept for a while.
+
+
+_KEPT_FOR, _KEPT_UNCHANGED_FOR = timedelta(seconds=60), timedelta(hours=1)
+_MAX_EXTENTS = 4096
+_MAX_GRIDS = 64  # of some MB
+Kept = TypeVar("Kept")
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,18 +270,34 @@ class _Overviews(Generic[Kept]):
         return 0 if head is None else head.number
 
 
+# === Reading features.
+
+
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page of features."""
+
+    features: orjson.Fragment  # a JSON array
+    returned: int
+    after: str | None  # the id to continue after, if there are more
+    matched: int | None  # how many features match, if that is known
+
+
 class Features:
-    """Reading features, one transaction each."""
+    """Reading features of collections, one transaction each."""
 
     def __init__(self, database: Database, clock: Clock) -> None:
         self._database = database
-        self._clock = clock
         self._extents = _Overviews[Extent | None](database, clock, _MAX_EXTENTS)
         self._grids = _Overviews[FeatureGrid](database, clock, _MAX_GRIDS)
 
     def page(
         self,
         caller: Caller,
+        collection: Collection,
         filtered: FeatureFilter,
         *,
         after: str | None = None,
@@ -299,24 +305,61 @@ class Features:
         crs: FeatureCrs = STORAGE_CRS,
         counted: bool = False,
     ) -> Page:
-        """A page of features in the order of their ids, counted if that is asked for or costs little."""
-        counted = counted or (after is None and _is_cheap(filtered))
+        """A page of features in a fixed order, counted if that is asked for or costs little.
+
+        Raises
+        ------
+        MalformedRequest
+            There is no line to go on after.
+        """
+        agency_id, is_first = caller.agency_id, after is None
+        if collection.lines is not None:
+            return self._page_of_lines(agency_id, collection.lines, filtered, after, limit, crs, counted)
+        counted = counted or (is_first and _is_cheap(filtered))
         texts, matched = self._ask(
-            filtered.table,
-            lambda c: store.list_features(c, caller.agency_id, filtered, after=after, limit=limit + 1, counted=counted),
+            collection.table,
+            lambda c: store.list_features(c, agency_id, filtered, after=after, limit=limit + 1, counted=counted),
         )
-        more = len(texts) > limit
-        if after is None and not more:
+        has_more = len(texts) > limit
+        if is_first and not has_more:
             matched = len(texts)
         del texts[limit:]
-        last = orjson.loads(texts[-1])["id"] if more else None
+        last = orjson.loads(texts[-1])["id"] if has_more else None
         if not crs.is_storage:
             texts = [orjson.dumps(_in_crs(orjson.loads(text), crs)).decode() for text in texts]
         return Page(_joined(texts), len(texts), last, matched)
 
-    def count(self, caller: Caller, filtered: FeatureFilter) -> int:
+    def _page_of_lines(
+        self,
+        agency_id: str,
+        lines: LineReader,
+        filtered: FeatureFilter,
+        after: str | None,
+        limit: int,
+        crs: FeatureCrs,
+        counted: bool,
+    ) -> Page:
+        """Lines are found one by one, so that a first page is counted by going on to the last one."""
+        matched: int | None = None
+        with self._database.read() as connection:
+            with closing(_matching(connection, agency_id, lines, filtered, after)) as found:
+                page = list(islice(found, limit + 1))
+                has_more = len(page) > limit
+                if after is None and (counted or not has_more):
+                    matched = len(page) + sum(1 for _ in found)
+            if after is not None and counted:
+                matched = _count_lines(connection, agency_id, lines, filtered)
+        del page[limit:]
+        texts = [orjson.dumps(_line(line, crs)).decode() for line in page]
+        return Page(_joined(texts), len(page), page[-1].id if has_more else None, matched)
+
+    def count(self, caller: Caller, collection: Collection, filtered: FeatureFilter) -> int:
         """How many features a filter leaves."""
-        return self._ask(filtered.table, lambda c: store.count_features(c, caller.agency_id, filtered))
+        agency_id = caller.agency_id
+        if collection.lines is not None:
+            with self._database.read() as connection:
+                return _count_lines(connection, agency_id, collection.lines, filtered)
+        return self._ask(collection.table, lambda c: store.count_features(c, agency_id, filtered))
 
     def get(
         self, caller: Caller, collection: Collection, feature_id: str, crs: FeatureCrs = STORAGE_CRS
@@ -328,108 +371,48 @@ class Features:
         NotFound
             There is none with this id in the collection, or it belongs to another agency.
         """
-        table = collection.table
-        text = self._ask(table, lambda c: store.find_feature(c, caller.agency_id, feature_id, table))
+        agency_id, table = caller.agency_id, collection.table
+        if collection.lines is not None:
+            with self._database.read() as connection:
+                line = collection.lines.find(connection, agency_id, feature_id)
+            if line is None:
+                raise no_feature(collection)
+            return _line(line, crs)
+        text = self._ask(table, lambda c: store.find_feature(c, agency_id, feature_id, table))
         if text is None:
             raise no_feature(collection)
         return _in_crs(orjson.loads(text), crs)
 
-    def lines(
-        self,
-        caller: Caller,
-        lines: LineReader,
-        filtered: FeatureFilter,
-        *,
-        after: str | None = None,
-        limit: int = 1000,
-        crs: FeatureCrs = STORAGE_CRS,
-        counted: bool = False,
-    ) -> Page:
-        """A page of lines, counted if that is asked for or costs nothing.
+    def extent(self, caller: Caller, collection: Collection) -> Extent | None:
+        """What the agency's features cover, as it was within the last minute."""
+        return self._extents.get(caller, collection, lambda: self._find_extent(caller.agency_id, collection))
 
-        Raises
-        ------
-        MalformedRequest
-            There is no line to go on after.
-        """
-        matched: int | None = None
-        with (
-            self._database.read() as connection,
-            closing(_matching(connection, caller, lines, filtered, after)) as found,
-        ):
-            page = list(islice(found, limit + 1))
-            more = len(page) > limit
-            if after is None and (counted or not more):
-                matched = len(page) + sum(1 for _ in found)
-        if after is not None and counted:
-            matched = self.count_lines(caller, lines, filtered)
-        del page[limit:]
-        texts = [orjson.dumps(_line(line, crs)).decode() for line in page]
-        return Page(_joined(texts), len(page), page[-1].id if more else None, matched)
-
-    def count_lines(self, caller: Caller, lines: LineReader, filtered: FeatureFilter) -> int:
-        """How many lines a filter leaves."""
-        with (
-            self._database.read() as connection,
-            closing(_matching(connection, caller, lines, filtered, None)) as found,
-        ):
-            return sum(1 for _ in found)
-
-    def get_line(
-        self, caller: Caller, collection: Collection, lines: LineReader, line_id: str, crs: FeatureCrs = STORAGE_CRS
-    ) -> dict[str, Any]:
-        """One line.
-
-        Raises
-        ------
-        NotFound
-            There is none with this id, or it belongs to another agency.
-        """
+    def _find_extent(self, agency_id: str, collection: Collection) -> Extent | None:
         with self._database.read() as connection:
-            line = lines.find(connection, caller.agency_id, line_id)
-        if line is None:
-            raise no_feature(collection)
-        return _line(line, crs)
+            if collection.lines is not None:
+                return collection.lines.extent(connection, agency_id)
+            return store.find_extent(connection, agency_id, collection.table)
 
     def tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
         """A vector tile of a collection; empty without features."""
-        table = collection.table
-        return self._ask(table, lambda c: feature_tile(c, caller.agency_id, tile, table, layer=collection.id))
+        agency_id, table = caller.agency_id, collection.table
+        return self._ask(table, lambda c: feature_tile(c, agency_id, tile, table, layer=collection.id))
 
     def grouped_tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
         """A vector tile with groups in place of too many features, as they were within the last minute.
 
         There is no margin around it, so that no feature is on two tiles.
         """
-        table = collection.table
+        agency_id, table = caller.agency_id, collection.table
         if tile.zoom <= GROUPED_ZOOM:
-            grid = self._grid(caller, collection)
+            grid = self._grids.get(
+                caller, collection, lambda: self._ask(table, lambda c: read_grid(c, agency_id, table, zoom=COARSE_ZOOM))
+            )
             if grid.count_on(tile) > MAX_SINGLE:
                 if tile.zoom > COARSE_ZOOM:
-                    grid = self._ask(table, lambda c: read_grid(c, caller.agency_id, table, zoom=tile.zoom, on=tile))
+                    grid = self._ask(table, lambda c: read_grid(c, agency_id, table, zoom=tile.zoom, on=tile))
                 return grid.write(tile, f"{collection.id}_groups")
-        return self._ask(
-            table, lambda c: feature_tile(c, caller.agency_id, tile, table, layer=collection.id, margin_px=0)
-        )
-
-    def _grid(self, caller: Caller, collection: Collection) -> FeatureGrid:
-        def count() -> FeatureGrid:
-            return self._ask(
-                collection.table, lambda c: read_grid(c, caller.agency_id, collection.table, zoom=COARSE_ZOOM)
-            )
-
-        return self._grids.get(caller, collection, count)
-
-    def extent(self, caller: Caller, collection: Collection) -> Extent | None:
-        """What the agency's features cover, as it was within the last minute."""
-
-        def find() -> Extent | None:
-            with self._database.read() as connection:
-                if collection.lines is not None:
-                    return collection.lines.extent(connection, caller.agency_id)
-                return store.find_extent(connection, caller.agency_id, collection.table)
-
-        return self._extents.get(caller, collection, find)
+        return self._ask(table, lambda c: feature_tile(c, agency_id, tile, table, layer=collection.id, margin_px=0))
 
     def _ask(self, table: FeatureTable, question: Callable[[sa.Connection], Answer]) -> Answer:
         """The result of a question; one about plans takes two statements, which see the same snapshot."""
@@ -444,11 +427,15 @@ def no_feature(collection: Collection) -> NotFound:
     return NotFound(f"there is no such feature in {collection.id}", field="featureId")
 
 
+# === Features as they are written: points as they are stored, lines as they are found.
+
+
 def _matching(
-    connection: sa.Connection, caller: Caller, lines: LineReader, filtered: FeatureFilter, after: str | None
+    connection: sa.Connection, agency_id: str, lines: LineReader, filtered: FeatureFilter, after: str | None
 ) -> Generator[Line]:
+    """The lines that a filter leaves; the reader leaves out only those that it need not read."""
     wanted, box = dict(filtered.equal), filtered.box
-    with closing(lines.read(connection, caller.agency_id, filtered, after)) as found:
+    with closing(lines.read(connection, agency_id, filtered, after)) as found:
         for line in found:
             if (
                 all(line.properties[name] == value for name, value in wanted.items())
@@ -456,6 +443,11 @@ def _matching(
                 and (box is None or _crosses(line, box))
             ):
                 yield line
+
+
+def _count_lines(connection: sa.Connection, agency_id: str, lines: LineReader, filtered: FeatureFilter) -> int:
+    with closing(_matching(connection, agency_id, lines, filtered, None)) as found:
+        return sum(1 for _ in found)
 
 
 def _crosses(line: Line, box: Box) -> bool:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from typing import Any
 
 import sqlalchemy as sa
@@ -13,10 +12,11 @@ import sqlalchemy as sa
 from app.encoders.magnet.codebook import CodebookRules
 from app.errors import CodeTaken, Conflict, InvalidParameter
 from app.families import FAMILIES
-from app.families.surveys import PLANNED, Commitment, MarkerRules
+from app.families.family import Family
+from app.families.surveys import PLANNED, Commitment, MarkerRules, PlannedRow
 from app.markers.magnet_design import Codebook
 from app.planning.outputs.plan_document import read_plan
-from app.planning.plan import Plan, PlannedTag
+from app.planning.plan import Plan, PlannedMarker, PlannedTag
 from app.planning.plan_checks import ExistingMarker
 from app.radio.settings import RadioSettings
 from app.registry import markers
@@ -55,118 +55,13 @@ from app.services.plans.proofs import APPROVED, CHECKED, COMMITTED, DRAFT, PROVE
 from app.services.plans.tasks import CompareTask, MadePlan, MakePlanTask, WritePlanFileTask
 from app.services.ports import Blobs, Clock, DecoderProcesses
 
-# === An approved plan becomes planned markers, in the caller's transaction and under one entry of the audit log.
-
-
-_PART = 2000  # rows that are stored at a time; source: chosen by hand, as imports
-
-
-def commit_markers(
-    connection: sa.Connection, caller: Caller, row: PlanRow, plan: Plan, rules: MarkerRules, now: datetime
-) -> tuple[int, int]:
-    """Store the markers of a plan; returns how many, and how many planned markers became none.
-
-    Raises
-    ------
-    Conflict
-        The codebook of the plan was changed since.
-    """
-    codebook_id = _store_codebook(connection, caller, plan, now)
-    commitment = Commitment(row.id, plan.alignment, rules, now, codebook_id, plan.radio or RadioSettings())
-    with recording(
-        connection, caller.agency_id, author_of(caller), "plan.committed", now=now, subject=row.id,
-        detail={"markers": plan.counts},
-    ) as entry:  # fmt: skip
-        stored: list[tuple[int, str]] = []
-        covered, number = 0, 0
-        with markers.many_markers(connection, len(plan.markers)):
-            for family in FAMILIES:
-                own = [marker for marker in plan.markers if marker.family == family.name]
-                if not own:
-                    continue
-                assert family.planned is not None, f"no plan has markers of the family {family.name}"
-                rows = list(family.planned.rows(commitment, own))
-                covered += sum(found.covered for found in rows)
-                for start in range(0, len(rows), _PART):
-                    part = rows[start : start + _PART]
-                    ids = new_ids(now, len(part), number)
-                    number += 1
-                    columns = _columns(part, ids, family.name, plan, now)
-                    markers.add_markers(connection, entry, columns, kind=kind_of_new, why=f"plan {plan.name}")
-                    stored += zip((found.number for found in part), ids, strict=True)
-                    if family.planned.needs_index:
-                        for stored_row in columns.rows():
-                            family.index(connection, caller.agency_id, row_of(MarkerRow, stored_row))
-    link_markers(connection, caller.agency_id, row.id, stored)
-    return len(stored), len(plan.markers) - covered
-
-
-def _columns(part: list[Any], ids: list[str], family: str, plan: Plan, now: datetime) -> Columns:
-    """Rows as columns; what a family leaves out is empty."""
-    same = {
-        **dict.fromkeys(MarkerRow._fields),
-        "family": family,
-        "status": PLANNED,
-        "version": 1,
-        "created_at": now,
-        "updated_at": now,
-    }
-    names = sorted({name for found in part for name in found.columns} - {"id", "family"})
-    lists = {"id": ids, **{name: [found.columns.get(name) for found in part] for name in names}}
-    return Columns.of(len(part), {name: same[name] for name in same if name not in lists}, lists)
-
-
-def _store_codebook(connection: sa.Connection, caller: Caller, plan: Plan, now: datetime) -> str | None:
-    """The codebook of the plan's tags in the registry, with the entries that the plan added."""
-    book = plan.codebook
-    if book is None or not any(isinstance(marker.detail, PlannedTag) for marker in plan.markers):
-        return None
-    agency_id = caller.agency_id
-    row = CODEBOOKS.find(connection, agency_id, name=book.name)
-    if row is None:
-        rules = CodebookRules()
-        values = {
-            **first_version(now),
-            **book_columns(book),
-            "rules": rules_columns(rules),
-            "figures": design_figures(book.design, rules),
-        }
-        return CODEBOOKS.add(connection, agency_id, values).id
-    stored = book_of(row)
-    if stored.entries == book.entries:
-        return row.id
-    if not _extends(book, stored):
-        raise Conflict(
-            f"the codebook {book.name} was changed since the plan was made",
-            field="plan",
-            limit="the codes of the plan's tags are free in the codebook",
-            cure="PATCH the plan with its own rules: its tags get codes from the codebook as it is",
-        )
-    entries = {"entries": book_columns(book)["entries"]}
-    return CODEBOOKS.update(connection, agency_id, row.id, entries, version=row.version, now=now).id
-
-
-def _extends(longer: Codebook, book: Codebook) -> bool:
-    return longer.design == book.design and longer.entries[: len(book.entries)] == book.entries
-
-
-# === Plans.
-
-
 MAX_EXISTING = 200_000
-"""Markers of the registry near a road that a plan is checked against. Source: chosen by hand, bounds the memory."""
-_MARGIN_M = 100.0  # [m] around the road; source: chosen by hand, five times the distance of confusable codes
+"""Markers of the registry near a road that a plan is checked against; bounds the memory."""
+_MARGIN_M = 100.0  # [m] around the road: five times the distance of confusable codes
 PLACED = 0.9
 """Progress of a job whose plan is placed and checked, and is stored next."""
-_TRIES = 4  # of drawing registry numbers that nobody has; source: chosen by hand
-
-
-@dataclass(frozen=True, slots=True)
-class PlanChange:
-    """What to change of a plan; what is not in `values` (name, rules) stays."""
-
-    values: dict[str, Any] = field(default_factory=dict)
-    reason: str | None = None
+_TRIES = 4  # of drawing registry numbers that nobody has
+_CHANGEABLE = (DRAFT, CHECKED, PROVED, APPROVED)
 
 
 class Plans:
@@ -185,14 +80,16 @@ class Plans:
         self._database, self._clock, self._blobs, self._processes = database, clock, blobs, processes
         self._rules = rules
 
-    @property
-    def _ttl(self) -> timedelta:
-        return self._rules.idempotency_ttl
-
     def make(
-        self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any], key: IdempotencyKey | None = None,
-        *, job: RunningJob | None = None,
-    ) -> tuple[PlanDocument, bool]:  # fmt: skip
+        self,
+        caller: Caller,
+        name: str,
+        alignment_id: str,
+        rules: dict[str, Any],
+        key: IdempotencyKey | None = None,
+        *,
+        job: RunningJob | None = None,
+    ) -> tuple[PlanDocument, bool]:
         """Place and check the markers of a new plan, and store it.
 
         Parameters
@@ -232,7 +129,7 @@ class Plans:
             document_key = stage.put("plans", made.document)
             with (
                 self._database.write(long=True) as connection,
-                idempotent(connection, agency_id, key, now, self._ttl) as answer,
+                idempotent(connection, agency_id, key, now, self._rules.idempotency_ttl) as answer,
             ):
                 if answer.replayed:
                     return answer.response, True
@@ -287,7 +184,16 @@ class Plans:
             rows, last = PLANS.history(connection, caller.agency_id, plan_id, after=after, limit=limit)
         return {"items": [document_of(PlanVersionDocument, row, plan=row.stored) for row in rows]}, last
 
-    def change(self, caller: Caller, plan_id: str, change: PlanChange, version: int | None) -> PlanDocument:
+    def change(
+        self,
+        caller: Caller,
+        plan_id: str,
+        version: int | None,
+        *,
+        name: str | None = None,
+        rules: dict[str, Any] | None = None,
+        reason: str | None = None,
+    ) -> PlanDocument:
         """Rename a plan, or place and check it again by other rules; the proof and the approval are then gone.
 
         Raises
@@ -297,26 +203,36 @@ class Plans:
             Another plan has the name, or the plan is committed.
         """
         row = self._get(caller, plan_id)
-        _check_status(row, (DRAFT, CHECKED, PROVED, APPROVED), "changed", "make another plan on the same alignment")
-        name, rules = change.values.get("name", row.name), change.values.get("rules", row.rules)
-        made = self.place(caller, name, row.alignment_id, rules) if "rules" in change.values else None
+        cure = "make another plan on the same alignment"
+        _check_status(row, _CHANGEABLE, "changed", cure)
+        made = None if rules is None else self.place(caller, name or row.name, row.alignment_id, rules)
         now, agency_id = self._clock(), caller.agency_id
         with staged(self._blobs) as stage:
-            changes: dict[str, Any] = {"name": name}
-            if made is not None:
+            changes: dict[str, Any] = {"name": name or row.name}
+            if made is not None and rules is not None:
                 changes |= _made_columns(caller, made, rules, stage.put("plans", made.document))
             with self._database.write(long=made is not None) as connection:
                 row = PLANS.get_at(connection, agency_id, plan_id, version)
-                _check_status(row, (DRAFT, CHECKED, PROVED, APPROVED), "changed", "make another plan")
-                if name != row.name:
-                    PLANS.check_name(connection, agency_id, name)
-                document = _changed(connection, caller, row, changes, now, "plan.changed", change.reason)
+                _check_status(row, _CHANGEABLE, "changed", cure)
+                if changes["name"] != row.name:
+                    PLANS.check_name(connection, agency_id, changes["name"])
+                changed = PLANS.update(
+                    connection,
+                    agency_id,
+                    plan_id,
+                    changes,
+                    version=row.version,
+                    now=now,
+                    who=caller.label,
+                    why=reason,
+                )
+                _log_plan(connection, caller, "plan.changed", changed, now)
                 if made is not None:
                     replace_planned(connection, agency_id, plan_id, made.features)
             stage.keep()
         if made is not None:
             delete_unused(self._blobs, files_of(row.proof))
-        return document
+        return plan_document(changed)
 
     def approve(self, caller: Caller, plan_id: str, version: int | None) -> PlanDocument:
         """Approve a plan that somebody else made and that passed its checks.
@@ -327,8 +243,9 @@ class Plans:
         Conflict
             The author approves, a check fails, or the plan is approved already.
         """
+        now, agency_id = self._clock(), caller.agency_id
         with self._database.write() as connection:
-            row = PLANS.get_at(connection, caller.agency_id, plan_id, version)
+            row = PLANS.get_at(connection, agency_id, plan_id, version)
             _check_status(row, (CHECKED, PROVED), "approved", "change its rules until every check passes")
             if row.author_id == caller.key_id:
                 raise Conflict(
@@ -338,7 +255,11 @@ class Plans:
                     cure="let the holder of another key approve it",
                 )
             changes = {"status": APPROVED, "approver": caller.label}
-            return _changed(connection, caller, row, changes, self._clock(), "plan.approved", None)
+            approved = PLANS.update(
+                connection, agency_id, plan_id, changes, version=row.version, now=now, who=caller.label
+            )
+            _log_plan(connection, caller, "plan.approved", approved, now)
+        return plan_document(approved)
 
     def commit(
         self, caller: Caller, plan_id: str, version: int | None, key: IdempotencyKey | None = None
@@ -360,7 +281,7 @@ class Plans:
         plan = read_plan(zlib.decompress(self._blobs.get(row.document_key)))
         with (
             self._database.write(long=True) as connection,
-            idempotent(connection, agency_id, key, now, self._ttl) as answer,
+            idempotent(connection, agency_id, key, now, self._rules.idempotency_ttl) as answer,
         ):
             if answer.replayed:
                 return answer.response, True
@@ -373,9 +294,11 @@ class Plans:
                     limit="codes that no other marker has",
                     cure="PATCH the plan with its own rules: its markers get new codes",
                 )
-            markers, uncommitted = commit_markers(connection, caller, row, plan, self._rules, now)
-            committed = _changed(connection, caller, row, {"status": COMMITTED}, now, None, None)
-            document = answer.store(CommittedPlan(**committed, markers=markers, uncommitted=uncommitted))
+            markers, uncommitted = _commit_markers(connection, caller, row, plan, self._rules, now)
+            committed = PLANS.update(
+                connection, agency_id, plan_id, {"status": COMMITTED}, version=row.version, now=now, who=caller.label
+            )
+            document = answer.store(CommittedPlan(**plan_document(committed), markers=markers, uncommitted=uncommitted))
         return document, False
 
     def file(
@@ -437,7 +360,9 @@ class Plans:
                 if not found:
                     return made
                 taken |= found
-        raise Conflict("no unused registry numbers were found", field="rules", cure="try again, or name the plan anew")
+        raise Conflict(
+            "no unused registry numbers were found", field="rules", cure="try again, or give the plan another name"
+        )
 
     # --- steps ------------------------------------------------------------------------------------------------------
 
@@ -519,19 +444,107 @@ def _check_status(row: PlanRow, allowed: tuple[str, ...], what: str, cure: str) 
         )
 
 
-def _changed(
-    connection: sa.Connection,
-    caller: Caller,
-    row: PlanRow,
-    changes: Mapping[str, Any],
-    now: datetime,
-    action: str | None,
-    why: str | None,
-) -> PlanDocument:
-    """Change a plan; `action` names the entry of the audit log, None where another entry covers the change."""
-    changed = PLANS.update(
-        connection, caller.agency_id, row.id, changes, version=row.version, now=now, who=caller.label, why=why
-    )
-    if action is not None:
-        log_change(connection, caller, action, now=now, subject=row.id, document=changed.rules, status=changed.status)
-    return plan_document(changed)
+def _log_plan(connection: sa.Connection, caller: Caller, action: str, row: PlanRow, now: datetime) -> None:
+    log_change(connection, caller, action, now=now, subject=row.id, document=row.rules, status=row.status)
+
+
+# === An approved plan becomes planned markers, in the caller's transaction and under one entry of the audit log.
+
+
+_PART = 2000  # rows that are stored at a time, as by imports
+
+
+def _commit_markers(
+    connection: sa.Connection, caller: Caller, row: PlanRow, plan: Plan, rules: MarkerRules, now: datetime
+) -> tuple[int, int]:
+    """Store the markers of a plan; returns how many, and how many planned markers became none.
+
+    Raises
+    ------
+    Conflict
+        The codebook of the plan was changed since.
+    """
+    codebook_id = _store_codebook(connection, caller, plan, now)
+    commitment = Commitment(row.id, plan.alignment, rules, now, codebook_id, plan.radio or RadioSettings())
+    stored: list[tuple[int, str]] = []
+    covered = 0
+    author, detail = author_of(caller), {"markers": plan.counts}
+    with (
+        recording(
+            connection, caller.agency_id, author, "plan.committed", now=now, subject=row.id, detail=detail
+        ) as entry,
+        markers.many_markers(connection, len(plan.markers)),
+    ):
+        for number, (family, part) in enumerate(_parts(commitment, plan.markers)):
+            ids = new_ids(now, len(part), number)
+            columns = _columns(part, ids, family.name, now)
+            markers.add_markers(connection, entry, columns, kind=kind_of_new, why=f"plan {plan.name}")
+            if family.planned is not None and family.planned.needs_index:
+                for stored_row in columns.rows():
+                    family.index(connection, caller.agency_id, row_of(MarkerRow, stored_row))
+            stored += zip((planned.number for planned in part), ids, strict=True)
+            covered += sum(planned.covered for planned in part)
+    link_markers(connection, caller.agency_id, row.id, stored)
+    return len(stored), len(plan.markers) - covered
+
+
+def _parts(
+    commitment: Commitment, planned: Sequence[PlannedMarker]
+) -> Iterator[tuple[Family[Any, Any], list[PlannedRow]]]:
+    """Rows of the planned markers, family by family, as many at a time as are stored in one step."""
+    for family in FAMILIES:
+        own = [marker for marker in planned if marker.family == family.name]
+        if own:
+            assert family.planned is not None, f"no plan has markers of the family {family.name}"
+            rows = list(family.planned.rows(commitment, own))
+            yield from ((family, rows[start : start + _PART]) for start in range(0, len(rows), _PART))
+
+
+def _columns(part: list[PlannedRow], ids: list[str], family: str, now: datetime) -> Columns:
+    """Rows as columns; what a family leaves out is empty."""
+    same = {
+        **dict.fromkeys(MarkerRow._fields),
+        "family": family,
+        "status": PLANNED,
+        "version": 1,
+        "created_at": now,
+        "updated_at": now,
+    }
+    names = sorted({name for planned in part for name in planned.columns} - {"id", "family"})
+    lists: dict[str, Sequence[Any]] = {"id": ids}
+    lists |= {name: [planned.columns.get(name) for planned in part] for name in names}
+    return Columns.of(len(part), {name: same[name] for name in same if name not in lists}, lists)
+
+
+def _store_codebook(connection: sa.Connection, caller: Caller, plan: Plan, now: datetime) -> str | None:
+    """The codebook of the plan's tags in the registry, with the entries that the plan added."""
+    book = plan.codebook
+    if book is None or not any(isinstance(marker.detail, PlannedTag) for marker in plan.markers):
+        return None
+    agency_id = caller.agency_id
+    row = CODEBOOKS.find(connection, agency_id, name=book.name)
+    if row is None:
+        rules = CodebookRules()
+        values = {
+            **first_version(now),
+            **book_columns(book),
+            "rules": rules_columns(rules),
+            "figures": design_figures(book.design, rules),
+        }
+        return CODEBOOKS.add(connection, agency_id, values).id
+    stored = book_of(row)
+    if stored.entries == book.entries:
+        return row.id
+    if not _extends(book, stored):
+        raise Conflict(
+            f"the codebook {book.name} was changed since the plan was made",
+            field="plan",
+            limit="the codes of the plan's tags are free in the codebook",
+            cure="PATCH the plan with its own rules: its tags get codes from the codebook as it is",
+        )
+    entries = {"entries": book_columns(book)["entries"]}
+    return CODEBOOKS.update(connection, agency_id, row.id, entries, version=row.version, now=now).id
+
+
+def _extends(longer: Codebook, book: Codebook) -> bool:
+    return longer.design == book.design and longer.entries[: len(book.entries)] == book.entries

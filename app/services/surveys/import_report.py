@@ -16,7 +16,7 @@ from app.families import FAMILIES
 from app.families.surveys import Rows
 from app.formats.format import SpooledFile
 from app.formats.surveys.declaration import ControlPoint, ImportDeclaration, LocalGrid
-from app.formats.surveys.table import Change, Detected, Fault, Faults, Severity
+from app.formats.surveys.table import Change, Detected, Fault, Severity
 from app.plots.track import draw_residuals
 from app.registry.conditions import grade_columns
 from app.registry.jobs import JobRow, JobState
@@ -161,11 +161,9 @@ def import_job_summary(job: JobRow) -> ImportJobSummary:
 
 
 def comparison_document(
-    found: Comparison | None, survey: GeoreferencedSurvey, known: Sequence[MarkerRow], tolerance_m: float
-) -> ComparisonDocument | None:
+    found: Comparison, survey: GeoreferencedSurvey, known: Sequence[MarkerRow], tolerance_m: float
+) -> ComparisonDocument:
     """A comparison as reports of imports have it; `known` are the markers that its rows are matched with."""
-    if found is None:
-        return None
     residuals: list[Residual] = [
         {
             "row": int(row) + 1,
@@ -236,26 +234,21 @@ class ImportInput:
     list_rows: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """What an import has found and stored."""
-
-    request: ImportInput
-    survey: GeoreferencedSurvey
-    faults: Faults
-    good: Rows  # indices of the rows that are stored, or would be
-    stored: int
-    # `grid`, `comparison`: their documents
-    grid: LocalGridDocument | None
-    comparison: ComparisonDocument | None
-
-
-def import_report(outcome: Outcome, found: Found) -> ImportReport:
+def import_report(
+    outcome: Outcome,
+    request: ImportInput,
+    survey: GeoreferencedSurvey,
+    *,
+    good_rows: Rows,
+    stored: int,
+    local_grid: LocalGridDocument | None,
+    comparison: ComparisonDocument | None,
+) -> ImportReport:
     """The report on an import, as the API returns it."""
-    request, table, placed = found.request, found.survey.table, found.survey.placed
-    refused = found.faults.flags(table.rows, Severity.REFUSED)
-    warned = found.faults.flags(table.rows, Severity.WARNING)
-    shown = found.faults.shown(MAX_FAULTS)
+    table, placed, faults = survey.table, survey.placed, survey.table.faults
+    refused = faults.flags(table.rows, Severity.REFUSED)
+    warned = faults.flags(table.rows, Severity.WARNING)
+    shown = faults.shown(MAX_FAULTS)
     rmse_m = request.declaration.survey.get("horizontal_rmse_m")
     grade = grade_columns(rmse_m, placed.transform_accuracy_m, placed.note)
     lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
@@ -270,26 +263,26 @@ def import_report(outcome: Outcome, found: Found) -> ImportReport:
         "localization_grade": grade["localization_grade"],
         "transform_note": grade["transform_note"],
         "detected": [detected_document(detected) for detected in table.detected],
-        "local_grid": found.grid,
+        "local_grid": local_grid,
         "accuracy": accuracy_document(*(request.declaration.survey.get(name) for name in _ACCURACY)),
         "rows": table.rows,
-        "good_rows": len(found.good),
+        "good_rows": len(good_rows),
         "refused_rows": int(refused.sum()),
         "warned_rows": int((warned & ~refused).sum()),
         "left_out_rows": sum(row <= table.rows for row in set(request.declaration.leave_out)),
-        "stored": found.stored,
+        "stored": stored,
         "extent_deg": [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())] if len(lon) else None,
-        "counts": dict(found.faults.counts),
-        "comparison": found.comparison,
+        "counts": dict(faults.counts),
+        "comparison": comparison,
         "faults": [fault_document(fault) for fault in shown],
-        "faults_left_out": len(found.faults) - len(shown),
-        "listed": _listed_rows(found, shown) if request.list_rows else [],
+        "faults_left_out": len(faults) - len(shown),
+        "listed": _listed_rows(request, survey, shown) if request.list_rows else [],
     }
 
 
-def _listed_rows(found: Found, shown: list[Fault]) -> list[SurveyRow]:
+def _listed_rows(request: ImportInput, survey: GeoreferencedSurvey, shown: list[Fault]) -> list[SurveyRow]:
     """Rows with faults, and others evenly spread over the file, in the order of the file."""
-    rows, most = found.survey.table.rows, found.request.list_rows
+    rows, most = survey.table.rows, request.list_rows
     faulty = dict.fromkeys(fault.row - 1 for fault in shown if fault.row is not None and fault.row <= rows)
     chosen = set(list(faulty)[:most])
     if rows <= most:
@@ -297,18 +290,18 @@ def _listed_rows(found: Found, shown: list[Fault]) -> list[SurveyRow]:
     elif len(chosen) < most:
         spread = np.linspace(0, rows - 1, most - len(chosen)).round().astype(int).tolist()
         chosen.update(spread)
-    states = _states(found)
-    return [_row(found.survey, index, states[index]) for index in sorted(chosen)]
+    states = _states(request, survey)
+    return [_row(survey, index, states[index]) for index in sorted(chosen)]
 
 
-def _states(found: Found) -> list[RowState]:
-    rows = found.survey.table.rows
+def _states(request: ImportInput, survey: GeoreferencedSurvey) -> list[RowState]:
+    rows = survey.table.rows
     states: list[RowState] = ["good"] * rows
     flags: tuple[tuple[RowState, Severity], ...] = (("warning", Severity.WARNING), ("refused", Severity.REFUSED))
     for state, severity in flags:
-        for index in np.flatnonzero(found.faults.flags(rows, severity)).tolist():
+        for index in np.flatnonzero(survey.table.faults.flags(rows, severity)).tolist():
             states[index] = state
-    for row in found.request.declaration.leave_out:
+    for row in request.declaration.leave_out:
         if row <= rows:
             states[row - 1] = "left-out"
     return states
@@ -336,9 +329,10 @@ def _cell(survey: GeoreferencedSurvey, role: str, index: int) -> str | None:
 # === What was declared of a survey, as the API takes it and as a queued import stores it, becomes typed values.
 
 
-_SURVEYS = {family.name: family.survey for family in FAMILIES if family.survey is not None}
+SURVEY_IMPORTS = {family.name: family.survey for family in FAMILIES if family.survey is not None}
+"""Families whose markers can be imported from points, and how."""
 _NOT_OF_THE_SURVEY = {"dry_run", "mode", "reason", "warnings", "list_rows"}.union(
-    *(s.members.model_fields for s in _SURVEYS.values())
+    *(s.members.model_fields for s in SURVEY_IMPORTS.values())
 )
 
 
@@ -376,4 +370,4 @@ def import_input(declared: Mapping[str, Any], file: SpooledFile) -> ImportInput:
 
 def _defaults(declared: Mapping[str, Any]) -> Any:
     """Of the declared family; members of the other families are checked too."""
-    return {name: survey.defaults(declared) for name, survey in _SURVEYS.items()}.get(declared["family"])
+    return {name: survey.defaults(declared) for name, survey in SURVEY_IMPORTS.items()}.get(declared["family"])

@@ -10,9 +10,10 @@ from urllib.parse import parse_qs, urlsplit
 import httpx
 import lxml.html
 import pytest
+from jinja2 import UndefinedError
 
 from app.api.ogc import pages
-from app.api.ogc.pages import Markup, anchor, element, table
+from app.api.templates import render_page
 from app.services.access.access import Scope
 from app.services.markers.features import COLLECTIONS
 from tests.api.ogc.test_features import ITEMS, MERCATOR, ROW, add
@@ -164,16 +165,14 @@ def test_every_text_is_escaped(client: httpx.Client, row: list[str]) -> None:
     for path in (ITEMS, f"{ITEMS}/{row[0]}"):
         text = client.get(path, params={"f": "html"}).text
         assert "<script" not in text
-        assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; &quot;A7&quot; &#x27;x&#x27;" in text
+        assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; &#34;A7&#34; &#39;x&#39;" in text
     injected = f"{ITEMS}?road=%22%3E%3Cscript%3E&limit=1"
     assert "<script" not in client.get(injected, headers={"Accept": "text/html"}).text
 
 
-def test_elements_escape_by_themselves() -> None:
-    assert element("p", "<b>", Markup("<i>"), None, href='"&') == '<p href="&quot;&amp;">&lt;b&gt;<i></p>'
-    assert anchor("?a=1&b=2", "x<y", class_="k", title=None) == '<a href="?a=1&amp;b=2" class="k">x&lt;y</a>'
-    assert "<caption>&lt;&gt;</caption>" in table("<>", ("a",), [("&",)])
-    assert element("meta", charset="utf-8") == '<meta charset="utf-8">'
+def test_a_value_that_a_template_lacks_is_an_error() -> None:
+    with pytest.raises(UndefinedError):
+        render_page("ogc/schema.html", title="no collection")
 
 
 def test_problems_stay_documents(client: httpx.Client) -> None:

@@ -135,13 +135,13 @@ def test_one_that_stores_says_that_it_is_too_late(
     server: LiveServer, client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = _send(client, _csv(), DEGREES, **LATER).json()
-    store, asked = imports._Running.store, []
+    store, asked = imports._Import.store, []
 
-    def slow(*given: Any) -> None:
+    def slow(*arguments: Any) -> int:
         asked.append(_cancel(client, job["id"]))  # while the writer has the database
-        store(*given)
+        return store(*arguments)
 
-    monkeypatch.setattr(imports._Running, "store", slow)
+    monkeypatch.setattr(imports._Import, "store", slow)
     server.app.state.use_cases.jobs.run_job(job["id"])
     asked.append(_cancel(client, job["id"]))
     assert [answer.status_code for answer in asked] == [409, 409]
@@ -157,19 +157,19 @@ def test_one_that_was_storing_when_the_server_stopped_goes_on(
     server: LiveServer, client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = _send(client, _csv(), DEGREES, **LATER).json()
-    store = imports._Running.store
+    store = imports._Import.store
 
-    def broken(*given: Any) -> None:
-        store(*given)
+    def broken(*arguments: Any) -> int:
+        store(*arguments)
         raise Unavailable("the server stops")
 
-    monkeypatch.setattr(imports._Running, "store", broken)
+    monkeypatch.setattr(imports._Import, "store", broken)
     with pytest.raises(Unavailable):
         server.app.state.use_cases.jobs.run_job(job["id"])
     assert _markers(client) == []
     assert client.get(f"/v1/imports/{job['id']}").json()["state"] == "queued"
     assert _cancel(client, job["id"]).status_code == 409
     assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 409
-    monkeypatch.setattr(imports._Running, "store", store)
+    monkeypatch.setattr(imports._Import, "store", store)
     server.app.state.use_cases.jobs.run_job(job["id"])
     assert client.get(f"/v1/imports/{job['id']}").json()["report"]["stored"] == 8
