@@ -18,7 +18,7 @@ from app.formats.video import VideoLimits
 from app.geodesy import check_lon_lat
 from app.registry.decodes import DecodeRow
 from app.sensors.camera import Camera
-from app.services.decodes.tasks import frame_terms, packet_terms, trace_terms
+from app.services.decodes.declarations import frame_terms, packet_terms, trace_terms
 
 # === Kinds of decodes.
 
@@ -324,12 +324,12 @@ class DecodeContext:
     captured_at : datetime, optional
         Aware.
     trace : dict, optional
-        The upload is a magnetometer trace, declared like this (`app.services.decodes.tasks.trace_terms`).
+        The upload is a magnetometer trace, declared like this (`app.services.decodes.declarations.trace_terms`).
     packets : dict, optional
-        The upload is a packet log, declared like this (`app.services.decodes.tasks.packet_terms`).
+        The upload is a packet log, declared like this (`app.services.decodes.declarations.packet_terms`).
     frames : dict, optional
         Frame rate, list and track of the frames of a drive, declared like this
-        (`app.services.decodes.tasks.frame_terms`).
+        (`app.services.decodes.declarations.frame_terms`).
     vehicle : dict, optional
         Id, name and version of the vehicle, and the source of each member
         (`app.services.fleet.vehicles.inherit`).

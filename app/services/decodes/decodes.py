@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import sqlalchemy as sa
+from typing_extensions import TypedDict
 
 from app.decoders.cerpm.merge import vehicle_positions
 from app.decoders.cerpm.verify import decode_message
@@ -29,17 +30,8 @@ from app.services.decodes.frame_documents import FramesResult
 from app.services.decodes.frame_poses import track_csv, track_geojson, track_gpx, track_points
 from app.services.decodes.outputs import readings_csv, readings_geojson
 from app.services.decodes.packet_documents import MAX_REFUSED
-from app.services.decodes.tasks import (
-    DEFAULT_SERIES,
-    MAX_PACKETS,
-    MAX_POINTS,
-    MAX_SERIES,
-    DriveTask,
-    PacketsDocument,
-    SamplesDocument,
-    SamplesTask,
-    VehicleTrackDocument,
-)
+from app.services.decodes.packet_tasks import read_drive
+from app.services.decodes.trace_tasks import DEFAULT_SERIES, MAX_POINTS, MAX_SERIES, SamplesDocument, read_samples
 from app.services.decodes.upload_path import (
     DecodeDocument,
     DecodeHead,
@@ -256,6 +248,40 @@ _TRACK_WRITERS: Mapping[str, Callable[[DecodeRow], Any]] = {
 _READING_WRITERS: Mapping[str, Callable[[DecodeRow], Any]] = {"geojson": readings_geojson, "csv": readings_csv}
 
 
+MAX_PACKETS = 20_000
+"""Packets that are listed at most. Source: chosen by hand; 2 MB of JSON."""
+
+
+class VehicleTrackDocument(TypedDict):
+    """The vehicle's own track beside a packet log; the heading is null where it is not known."""
+
+    time_s: list[float]
+    lon_deg: list[float]
+    lat_deg: list[float]
+    heading_deg: list[float | None]
+
+
+class PacketsDocument(TypedDict):
+    """Packets of a log in the order of their times, as columns; null where a value is not known.
+
+    `time_s` are seconds since 1970-01-01 UTC. `verdict` is `accepted` for authentic packets and their repetitions, else
+    the reason why a packet was refused; it is null where the decode does not list it, which has 500 refused packets at
+    most. The position is that of the vehicle.
+    """
+
+    total: int
+    entry: list[int]
+    time_s: list[float | None]
+    number: list[int | None]
+    rssi_dbm: list[float | None]
+    snr_db: list[float | None]
+    verdict: list[str | None]
+    reason: list[str | None]
+    lon_deg: list[float | None]
+    lat_deg: list[float | None]
+    track: VehicleTrackDocument | None
+
+
 class DecodeDetails:
     """Use cases on what a decode and its upload hold beyond the stored result.
 
@@ -306,8 +332,8 @@ class DecodeDetails:
         declared = row.context.get("trace") or {}
         name = str(declared.get("file_name") or "recording")
         with self._blobs.opened(_upload_key(row)) as file:
-            task = SamplesTask(name, file, declared, names, from_s, to_s, min(points, MAX_POINTS), self._rules.traces)
-            return self._processes.submit(task).result()
+            most, limits = min(points, MAX_POINTS), self._rules.traces
+            return self._processes.run(read_samples, name, file, declared, names, from_s, to_s, most, limits)
 
     def packets(self, caller: Caller, decode_id: str) -> PacketsDocument:
         """Packets of a log with their strength and verdict, and the vehicle's track.
@@ -321,8 +347,8 @@ class DecodeDetails:
         declared = row.context.get("packets") or {}
         name = str(declared.get("file_name") or "packets")
         with self._blobs.opened(_upload_key(row)) as file:
-            task = DriveTask(name, file, declared, self._rules.packets, self._rules.images)
-            files = self._processes.submit(task).result()
+            rules = self._rules
+            files = self._processes.run(read_drive, name, file, declared, rules.packets, rules.images)
         return _packets(files.packets, files.track, row.result or {})
 
     def track(self, caller: Caller, decode_id: str, form: TrackForm) -> Any:

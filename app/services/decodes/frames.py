@@ -27,8 +27,10 @@ from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.sensors.camera import Camera
 from app.services.decodes.context import CoarsePosition, DecodeContext, DecodeKind, DecodeRules
+from app.services.decodes.declarations import frame_terms
 from app.services.decodes.frame_documents import DriveNotes, ReadFrame, ReadMarker, frames_result
-from app.services.decodes.frame_poses import FrameListTask, FramePlaces, FramePose, find_gaps
+from app.services.decodes.frame_poses import FramePlaces, FramePose, find_gaps
+from app.services.decodes.frame_tasks import FramePicture, FrameResult, FrameSearch, decode_frame, decode_frames
 from app.services.decodes.matching import (
     FRAME_READERS,
     NearbyMarkers,
@@ -37,8 +39,8 @@ from app.services.decodes.matching import (
     fuse_fixes,
     match_reading,
 )
-from app.services.decodes.tasks import FramePicture, FrameResult, FrameRunTask, FrameSearch, FrameTask, frame_terms
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
+from app.services.decodes.video_tasks import read_frame_lists
 from app.services.health.frames import frame_health, missed_observations, unregistered_readings
 from app.services.health.record import EVIDENCE
 from app.services.ports import Clock, DecoderProcesses, Pending
@@ -87,7 +89,7 @@ class StartedFrame:
 def search_for(nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:
     """What to look for in a frame of this camera."""
     searches = {name: reader.search(nearby.of(name), camera) for name, reader in FRAME_READERS.items()}
-    return FrameSearch({name: search for name, search in searches.items() if search is not None})
+    return {name: search for name, search in searches.items() if search is not None}
 
 
 class FrameHandler(UploadHandler[FrameSignal]):
@@ -146,8 +148,9 @@ def start_frame(
     """
     header = inspect_frame(file, context, limits)
     camera = context.camera.camera_for(header) if context.camera else None
-    task = FrameTask(FramePicture(file, context.thermal, context.thermal_range, limits))
-    return StartedFrame(camera, processes.submit(task, wait_s=wait_s), task.search)
+    picture = FramePicture(file, context.thermal, context.thermal_range, limits)
+    search: Future[FrameSearch] = Future()
+    return StartedFrame(camera, processes.submit(decode_frame, picture, search, wait_s=wait_s), search)
 
 
 def inspect_frame(file: SpooledFile, context: DecodeContext, limits: ImageLimits) -> ImageHeader:
@@ -292,7 +295,7 @@ class ArchiveFrame:
     name: str
     moment: FrameMoment
     picture: FramePicture | None = None
-    search: FrameSearch = field(default_factory=lambda: FrameSearch({}))
+    search: FrameSearch = field(default_factory=dict)
     nearby: NearbyMarkers = field(default_factory=NearbyMarkers)
     pixels: int = 0
     error: WaymarkError | None = None
@@ -352,8 +355,8 @@ class StartedRun:
             self._pending.cancel()
 
     def _submit(self, frames: list[ArchiveFrame]) -> Pending[tuple[FrameResult | WaymarkError, ...]] | None:
-        tasks = tuple((frame.picture, frame.search) for frame in frames if frame.picture is not None)
-        return self._processes.submit(FrameRunTask(tasks), wait_s=self._wait_s) if tasks else None
+        run = tuple((frame.picture, frame.search) for frame in frames if frame.picture is not None)
+        return self._processes.submit(decode_frames, run, wait_s=self._wait_s) if run else None
 
     def _alone(self, frame: ArchiveFrame, report: Callable[[], None]) -> FrameResult | WaymarkError:
         report()
@@ -494,8 +497,8 @@ class StartedArchive:
             files = tuple(
                 (m.name, m.data) for m in read_members(file, limits, only=is_beside_frames) if m.error is None
             )
-            task = FrameListTask(files, frame_terms(context.frames or {}).poses)
-            lists = self._processes.submit(task, wait_s=self._upload.wait_s).result()
+            poses = frame_terms(context.frames or {}).poses
+            lists = self._processes.run(read_frame_lists, files, poses, wait_s=self._upload.wait_s)
             self._places = FramePlaces(context, lists)
         self._places.check_names([name for name in names if not is_beside_frames(name)])
 

@@ -17,13 +17,14 @@ from app.errors import TooManyRequests, UnreadableUpload
 from app.formats.format import SpooledFile
 from app.geodesy import decimal_year
 from app.markers.cerpm import MAX_INVALID_TAGS_PER_DAY, MAX_INVALID_TAGS_PER_LOG
+from app.plots.lane import SignalPicture
 from app.registry import markers
 from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.registry.markers import CODEBOOKS, book_of
-from app.sensors.camera import Camera
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.decodes.context import DecodeContext, DecodeKind, DecodeRules
+from app.services.decodes.declarations import packet_terms, trace_terms
 from app.services.decodes.matching import (
     NearbyTags,
     ReadPackets,
@@ -34,18 +35,16 @@ from app.services.decodes.matching import (
     spans_of,
 )
 from app.services.decodes.packet_documents import claimed_place, packet_observations, packets_document
-from app.services.decodes.tasks import (
+from app.services.decodes.packet_tasks import (
     DriveFiles,
-    DriveTask,
     LaneResult,
-    LaneTask,
-    PacketTerms,
-    TraceResult,
-    TraceTask,
-    packet_terms,
-    trace_terms,
+    LeftOutMarker,
+    PosedCamera,
+    estimate_lane,
+    read_drive,
 )
 from app.services.decodes.trace_documents import trace_document
+from app.services.decodes.trace_tasks import TraceResult, decode_recording
 from app.services.decodes.upload_path import Decoded, OutdatedMatch, Upload, UploadHandler
 from app.services.health.record import EVIDENCE
 from app.services.health.traces import (
@@ -166,8 +165,17 @@ class TraceHandler(UploadHandler[TraceSignal]):
             nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m, epoch)
             formats = () if nearby.texts else _book_formats(connection, upload.agency_id)
         name = str(declared.get("file_name") or "recording")
-        task = TraceTask(name, upload.file, declared, nearby.texts, formats, self._rules.traces)
-        return StartedTrace(nearby, self._processes.submit(task, wait_s=upload.wait_s))
+        pending = self._processes.submit(
+            decode_recording,
+            name,
+            upload.file,
+            declared,
+            nearby.texts,
+            formats,
+            self._rules.traces,
+            wait_s=upload.wait_s,
+        )
+        return StartedTrace(nearby, pending)
 
     def plot(self, signal: TraceSignal) -> bytes:
         """The trace with what was found in it."""
@@ -227,10 +235,6 @@ def _what(wrong_way: bool, evidence: dict[str, Any]) -> str:
 # === Packet logs of CERPMs: verified against the registry, and a lane estimated through their markers.
 
 
-Pose = tuple[float, float, float]
-"""Longitude, latitude and heading of a vehicle. [deg]"""
-
-
 @dataclass(frozen=True, slots=True)
 class DriveSignal:
     """A drive past CERPMs: its packets, verified against the registry, and the lane through their markers."""
@@ -267,8 +271,8 @@ class PacketHandler(UploadHandler[DriveSignal]):
             self._invalid_tags.left(_holder(upload), upload.received_at)
         declared = upload.context.packets or {}
         name = str(declared.get("file_name") or "packets")
-        task = DriveTask(name, upload.file, declared, self._rules.packets, self._rules.images)
-        files = self._processes.submit(task, wait_s=upload.wait_s)
+        packets, images = self._rules.packets, self._rules.images
+        files = self._processes.submit(read_drive, name, upload.file, declared, packets, images, wait_s=upload.wait_s)
         return StartedDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
 
     def plot(self, signal: DriveSignal) -> bytes:
@@ -330,7 +334,6 @@ class StartedDrive:
         """Verify the packets against the registry as it is now, and estimate the lane."""
         upload, files = self.upload, self.files.result()
         terms = packet_terms(upload.context.packets or {})
-        camera, pose = _view(files, upload.context)
         with self.database.read() as connection:
             known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets), upload.again_id)
         max_invalid_tags = self.invalid_tags.left(_holder(upload), upload.received_at)
@@ -342,8 +345,17 @@ class StartedDrive:
             received_at=upload.received_at,
             observed_at=upload.observed_at,
         )
-        task = _lane_task(files, read, terms, camera, pose)
-        return DriveSignal(files, read, self.processes.submit(task, wait_s=upload.wait_s).result())
+        lane = self.processes.run(
+            estimate_lane,
+            lane_markers(read.merged),
+            _left_out(read),
+            files.track,
+            terms,
+            _signals(read),
+            _posed_camera(files, upload.context),
+            wait_s=upload.wait_s,
+        )
+        return DriveSignal(files, read, lane)
 
     def cancel(self) -> None:
         """Stop the process."""
@@ -354,28 +366,22 @@ def _holder(upload: Upload) -> str:
     return upload.author.key_id or upload.agency_id
 
 
-def _lane_task(
-    files: DriveFiles, read: ReadPackets, terms: PacketTerms, camera: Camera | None, pose: Pose | None
-) -> LaneTask:
+def _signals(read: ReadPackets) -> SignalPicture | None:
+    """Strengths of the accepted packets over the distance, and the path loss that was fitted to them."""
     profiles = [profile for profile in read.signal.profiles.values() if len(profile.distance_m)]
-    none = np.empty(0)
-    distance_m = np.concatenate([profile.distance_m for profile in profiles] or [none])
-    rssi_dbm = np.concatenate([profile.rssi_dbm for profile in profiles] or [none])
-    measured = np.isfinite(distance_m) & np.isfinite(rssi_dbm)
+    if not profiles:
+        return None
+    distance_m = np.concatenate([profile.distance_m for profile in profiles])
+    rssi_dbm = np.concatenate([profile.rssi_dbm for profile in profiles])
+    known = np.isfinite(distance_m) & np.isfinite(rssi_dbm)
+    if not known.any():
+        return None
     loss = read.signal.path_loss
-    return LaneTask(
-        lane_markers(read.merged),
-        _left_out(read),
-        files.track,
-        terms,
-        (distance_m[measured], rssi_dbm[measured]),
-        None if loss is None else (loss.at_1m_dbm, loss.exponent.value),
-        camera,
-        pose,
-    )
+    fitted = (None, None) if loss is None else (loss.at_1m_dbm, loss.exponent.value)
+    return SignalPicture(distance_m[known], rssi_dbm[known], *fitted)
 
 
-def _left_out(read: ReadPackets) -> tuple[tuple[int, float, float, str], ...]:
+def _left_out(read: ReadPackets) -> tuple[LeftOutMarker, ...]:
     found = []
     for number, reason in read.merged.left_out.items():
         lon_deg, lat_deg = claimed_place(number, read)
@@ -384,10 +390,10 @@ def _left_out(read: ReadPackets) -> tuple[tuple[int, float, float, str], ...]:
     return tuple(found)
 
 
-def _view(files: DriveFiles, context: DecodeContext) -> tuple[Camera | None, Pose | None]:
-    """Camera of the frame, and where the vehicle was and pointed when it was taken."""
+def _posed_camera(files: DriveFiles, context: DecodeContext) -> PosedCamera | None:
+    """Camera of the frame, and where the vehicle was and pointed when it was taken; None where either is unknown."""
     if files.frame is None or context.camera is None:
-        return None, None
+        return None
     camera = context.camera.camera_for(files.frame[1])
     track = files.track
     if track is not None and context.captured_at is not None:
@@ -397,8 +403,8 @@ def _view(files: DriveFiles, context: DecodeContext) -> tuple[Camera | None, Pos
         if np.isfinite(lon_deg) and headings.any():
             turned = np.unwrap(track.heading_deg[headings], period=360.0)
             heading_deg = float(np.interp(at_s, track.time_s[headings], turned)) % 360.0
-            return camera, (float(lon_deg), float(lat_deg), heading_deg)
+            return PosedCamera(camera, (float(lon_deg), float(lat_deg), heading_deg))
     coarse = context.coarse_position
     if coarse is not None and context.heading_deg is not None:
-        return camera, (coarse.lon_deg, coarse.lat_deg, context.heading_deg)
-    return camera, None
+        return PosedCamera(camera, (coarse.lon_deg, coarse.lat_deg, context.heading_deg))
+    return None

@@ -26,6 +26,7 @@ from app.formats.video import (
 from app.registry.database import Database
 from app.registry.spatial import distance_m
 from app.services.decodes.context import MAX_ACCURACY_M, CoarsePosition, DecodeContext, DecodeKind, DecodeRules
+from app.services.decodes.declarations import frame_terms
 from app.services.decodes.frame_documents import (
     DriveNotes,
     ReadFrame,
@@ -35,16 +36,16 @@ from app.services.decodes.frame_documents import (
 )
 from app.services.decodes.frame_poses import (
     FrameLists,
-    FrameListTask,
     FramePlaces,
     FramePose,
     GapDocument,
     ReceiverPositions,
 )
-from app.services.decodes.frames import FrameMoment, decoded_frames, read_frame
-from app.services.decodes.matching import FRAME_READERS, NearbyMarkers, find_nearby_markers
-from app.services.decodes.tasks import FrameResult, IndexVideoTask, SegmentResult, SegmentTask, frame_terms
+from app.services.decodes.frame_tasks import FrameResult
+from app.services.decodes.frames import FrameMoment, decoded_frames, read_frame, search_for
+from app.services.decodes.matching import NearbyMarkers, find_nearby_markers
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
+from app.services.decodes.video_tasks import SegmentResult, decode_segment, index_frames, read_frame_lists
 from app.services.ports import Clock, DecoderProcesses, Pending
 
 if TYPE_CHECKING:  # it loads numba
@@ -164,11 +165,11 @@ class StartedVideo:
             packed = open_packed_video(upload.file, self._rules.archives)
             video = packed.video
             if packed.beside:
-                task = FrameListTask(packed.beside, terms.poses)
-                self._places = FramePlaces(context, self._processes.submit(task, wait_s=wait_s).result())
+                lists = self._processes.run(read_frame_lists, packed.beside, terms.poses, wait_s=wait_s)
+                self._places = FramePlaces(context, lists)
         else:
             video = VideoFile(upload.file, kind)
-        index = self._processes.submit(IndexVideoTask(video, self._rules.videos, terms.rate_hz), wait_s=wait_s).result()
+        index = self._processes.run(index_frames, video, self._rules.videos, terms.rate_hz, wait_s=wait_s)
         self._signal.warnings += index.warnings
         self._signal.gaps += [
             {"after_frame": gap.after_frame, "before_frame": gap.before_frame, "seconds": gap.seconds,
@@ -199,13 +200,16 @@ class StartedVideo:
         if setup is not None:
             size = setup.width_px or index.width_px, setup.height_px or index.height_px
             camera = setup.camera_for(_header(*size))
-        wanted = {name: reader.search(nearby.of(name), camera) for name, reader in FRAME_READERS.items()}
-        task = SegmentTask(
-            index, number, {name: search for name, search in wanted.items() if search is not None},
+        pending = self._processes.submit(
+            decode_segment,
+            index,
+            number,
+            search_for(nearby, camera),
             self._upload.context.thermal,
             tuple((at, pose.speed_m_s) for at, pose in poses if pose.speed_m_s is not None),
-        )  # fmt: skip
-        return _OnItsWay(segment, self._processes.submit(task, wait_s=self._upload.wait_s), nearby)
+            wait_s=self._upload.wait_s,
+        )
+        return _OnItsWay(segment, pending, nearby)
 
     def _poses(self, index: VideoIndex, segment: VideoSegment) -> Iterator[tuple[float, FramePose]]:
         first_s, last_s = float(index.time_s[segment.first]), float(index.time_s[segment.end - 1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -15,10 +14,9 @@ from app.errors import InvalidParameter
 from app.families import FAMILIES, FAMILY_NAMES, get_family
 from app.families.family import Family, Registration
 from app.families.surveys import PLANNED, MarkerRules, RowCodes, Rows
-from app.formats.format import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
-from app.formats.surveys.table import Fault, Severity, SurveyTable
+from app.formats.surveys.table import Fault, Severity
 from app.registry import markers as bulk
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, EntryRow, find_head, recording
@@ -30,7 +28,7 @@ from app.services.access.access import Caller
 from app.services.access.audit import author_of
 from app.services.documents import kind_of_change, kind_of_new
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
-from app.services.ports import Clock, DecoderProcesses, Task
+from app.services.ports import Clock, DecoderProcesses
 from app.services.roads.documents import linear_references
 from app.services.surveys.import_report import (
     ALL,
@@ -51,6 +49,7 @@ from app.services.surveys.import_rows import (
     places_of,
     survey_box,
 )
+from app.services.surveys.tasks import read_survey_file
 from app.surveys.comparison import Comparison, RegisteredPoints, check_residuals, compare_survey, find_duplicates
 from app.surveys.consistency_checks import check_accuracy, check_consistency
 from app.surveys.georeference import (
@@ -71,15 +70,6 @@ _PART = 2000
 _ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
 _STANDING = "place_by_area_only"
 """The caution that every survey of a new road gets, however well it is declared."""
-
-
-@dataclass(frozen=True, slots=True)
-class SurveyTask(Task[SurveyTable]):
-    """A survey to read."""
-
-    file: SpooledFile
-    declaration: ImportDeclaration
-    code_form: CodeForm
 
 
 class Imports:
@@ -127,10 +117,10 @@ class Imports:
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
-        pending = self._processes.submit(
-            SurveyTask(given.file, given.declaration, _code_form(given)), wait_s=_BUSY_WAIT_S
+        table = self._processes.run(
+            read_survey_file, given.file, given.declaration, _code_form(given), wait_s=_BUSY_WAIT_S
         )
-        table, grid = apply_local_grid(pending.result(), given.declaration)
+        table, grid = apply_local_grid(table, given.declaration)
         table = without_rows(table, given.declaration.leave_out)
         survey = georeference_survey(table, given.declaration, self._rules.crs_accuracy_m)
         step(READ)
