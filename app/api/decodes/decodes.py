@@ -28,9 +28,9 @@ from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
 from app.services.decodes.decodes import DecodeDetails, PacketsDocument
 from app.services.decodes.decodes import Decodes as DecodesService
+from app.services.decodes.documents import DecodeDocument, DecodePage
 from app.services.decodes.outputs import DecodeOutputs
 from app.services.decodes.trace_tasks import MAX_POINTS, MAX_SERIES, SamplesDocument
-from app.services.decodes.upload_path import DecodeDocument, DecodePage
 
 router = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
 

@@ -124,7 +124,7 @@ class TraceSignal:
 
 
 @dataclass(frozen=True, slots=True)
-class StartedTrace:
+class PendingTrace:
     """A recording in a decoder process."""
 
     nearby: NearbyTags
@@ -156,7 +156,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
         check_not_empty(file)
         return file.size > self._rules.immediate_trace_bytes
 
-    def start(self, upload: Upload) -> StartedTrace:
+    def start(self, upload: Upload) -> PendingTrace:
         """Hand the recording over with the tags that the drive can have passed."""
         declared = upload.context.trace or {}
         position, reach_m = upload.context.coarse_position, trace_terms(declared).reach_m
@@ -175,7 +175,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
             self._rules.traces,
             wait_s=upload.wait_s,
         )
-        return StartedTrace(nearby, pending)
+        return PendingTrace(nearby, pending)
 
     def plot(self, signal: TraceSignal) -> bytes:
         """The trace with what was found in it."""
@@ -265,7 +265,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
         check_not_empty(file)
         return file.size > self._rules.immediate_trace_bytes
 
-    def start(self, upload: Upload) -> StartedDrive:
+    def start(self, upload: Upload) -> PendingDrive:
         """Have the files of the drive read."""
         if upload.again_id is None:
             self._invalid_tags.left(_holder(upload), upload.received_at)
@@ -273,7 +273,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
         name = str(declared.get("file_name") or "packets")
         packets, images = self._rules.packets, self._rules.images
         files = self._processes.submit(read_drive, name, upload.file, declared, packets, images, wait_s=upload.wait_s)
-        return StartedDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
+        return PendingDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
 
     def plot(self, signal: DriveSignal) -> bytes:
         """The lane and the radio signals."""
@@ -320,7 +320,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
 
 
 @dataclass(frozen=True, slots=True)
-class StartedDrive:
+class PendingDrive:
     """The files of a drive in a decoder process."""
 
     upload: Upload
