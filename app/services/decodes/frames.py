@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from functools import partial
 
 import sqlalchemy as sa
 
@@ -39,7 +40,7 @@ from app.services.decodes.matching import (
     fuse_fixes,
     match_reading,
 )
-from app.services.decodes.upload_path import Decoded, Upload, UploadHandler, cancelled_on_error
+from app.services.decodes.upload_path import Decoded, PendingSignal, Upload, UploadHandler, cancelled_on_error
 from app.services.decodes.video_tasks import read_frame_lists
 from app.services.health.frames import frame_health, missed_observations, unregistered_readings
 from app.services.health.record import EVIDENCE
@@ -58,24 +59,8 @@ _LARGE = threading.Semaphore(2)
 class FrameSignal:
     """What a decoder process found in a frame, and the markers that it was looking for."""
 
+    nearby: NearbyMarkers
     result: FrameResult
-    nearby: NearbyMarkers
-
-
-@dataclass(frozen=True, slots=True)
-class PendingFrame:
-    """A frame in a decoder process."""
-
-    nearby: NearbyMarkers
-    pending: Pending[FrameResult]
-
-    def result(self) -> FrameSignal:
-        """Wait for the readings."""
-        return FrameSignal(self.pending.result(), self.nearby)
-
-    def cancel(self) -> None:
-        """Stop the process."""
-        self.pending.cancel()
 
 
 def search_for(nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:
@@ -103,7 +88,7 @@ class FrameHandler(UploadHandler[FrameSignal]):
             raise unknown_picture(head, list_decoded(), _DECLARE)
         return False
 
-    def start(self, upload: Upload) -> PendingFrame:
+    def start(self, upload: Upload) -> Pending[FrameSignal]:
         """Hand the frame over, and look up the markers near by while the process loads the picture.
 
         Raises
@@ -123,7 +108,7 @@ class FrameHandler(UploadHandler[FrameSignal]):
             with self._database.read() as connection:
                 nearby = find_nearby_markers(connection, upload.agency_id, context.coarse_position)
             search.set_result(search_for(nearby, camera))
-        return PendingFrame(nearby, pending)
+        return PendingSignal(pending, partial(FrameSignal, nearby))
 
     def match(self, connection: sa.Connection, upload: Upload, signal: FrameSignal) -> Decoded:
         """Match the frame's readings."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ from app.services.decodes.packet_tasks import (
 )
 from app.services.decodes.trace_documents import trace_document
 from app.services.decodes.trace_tasks import TraceResult, decode_recording
-from app.services.decodes.upload_path import Decoded, OutdatedMatch, Upload, UploadHandler
+from app.services.decodes.upload_path import Decoded, OutdatedMatch, PendingSignal, Upload, UploadHandler
 from app.services.health.record import EVIDENCE
 from app.services.health.traces import (
     lane_directions,
@@ -119,24 +120,8 @@ def forgery_detail(verification: Verification) -> dict[str, int] | None:
 class TraceSignal:
     """What a decoder process found in a recording, and the tags that it was looking for."""
 
+    nearby: NearbyTags
     result: TraceResult
-    nearby: NearbyTags
-
-
-@dataclass(frozen=True, slots=True)
-class PendingTrace:
-    """A recording in a decoder process."""
-
-    nearby: NearbyTags
-    pending: Pending[TraceResult]
-
-    def result(self) -> TraceSignal:
-        """Wait for the findings."""
-        return TraceSignal(self.pending.result(), self.nearby)
-
-    def cancel(self) -> None:
-        """Stop the process."""
-        self.pending.cancel()
 
 
 class TraceHandler(UploadHandler[TraceSignal]):
@@ -156,7 +141,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
         check_not_empty(file)
         return file.size > self._rules.immediate_trace_bytes
 
-    def start(self, upload: Upload) -> PendingTrace:
+    def start(self, upload: Upload) -> Pending[TraceSignal]:
         """Hand the recording over with the tags that the drive can have passed."""
         declared = upload.context.trace or {}
         position, reach_m = upload.context.coarse_position, trace_terms(declared).reach_m
@@ -175,7 +160,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
             self._rules.traces,
             wait_s=upload.wait_s,
         )
-        return PendingTrace(nearby, pending)
+        return PendingSignal(pending, partial(TraceSignal, nearby))
 
     def plot(self, signal: TraceSignal) -> bytes:
         """The trace with what was found in it."""
@@ -265,7 +250,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
         check_not_empty(file)
         return file.size > self._rules.immediate_trace_bytes
 
-    def start(self, upload: Upload) -> PendingDrive:
+    def start(self, upload: Upload) -> Pending[DriveSignal]:
         """Have the files of the drive read."""
         if upload.again_id is None:
             self._invalid_tags.left(_holder(upload), upload.received_at)
@@ -273,7 +258,34 @@ class PacketHandler(UploadHandler[DriveSignal]):
         name = str(declared.get("file_name") or "packets")
         packets, images = self._rules.packets, self._rules.images
         files = self._processes.submit(read_drive, name, upload.file, declared, packets, images, wait_s=upload.wait_s)
-        return PendingDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
+        return PendingSignal(files, partial(self._verify, upload))
+
+    def _verify(self, upload: Upload, files: DriveFiles) -> DriveSignal:
+        """Verify the packets against the registry as it is now, and estimate the lane."""
+        terms = packet_terms(upload.context.packets or {})
+        with self._database.read() as connection:
+            numbers = list_numbers(files.packets)
+            known = find_known(connection, upload.agency_id, self._secrets, numbers, upload.again_id)
+        max_invalid_tags = self._invalid_tags.left(_holder(upload), upload.received_at)
+        read = read_packets_of(
+            files,
+            known,
+            terms,
+            max_invalid_tags,
+            received_at=upload.received_at,
+            observed_at=upload.observed_at,
+        )
+        lane = self._processes.run(
+            estimate_lane,
+            lane_markers(read.merged),
+            _left_out(read),
+            files.track,
+            terms,
+            _signals(read),
+            _posed_camera(files, upload.context),
+            wait_s=upload.wait_s,
+        )
+        return DriveSignal(files, read, lane)
 
     def plot(self, signal: DriveSignal) -> bytes:
         """The lane and the radio signals."""
@@ -317,49 +329,6 @@ class PacketHandler(UploadHandler[DriveSignal]):
         directions = lane_directions(list(received.values()), signal.files.track)
         missed = missed_cerpms(connection, upload.agency_id, read, signal.files, at)
         return [*with_evidence(rows, evidence, directions), *missed]
-
-
-@dataclass(frozen=True, slots=True)
-class PendingDrive:
-    """The files of a drive in a decoder process."""
-
-    upload: Upload
-    files: Pending[DriveFiles]
-    database: Database
-    processes: DecoderProcesses
-    secrets: AgencySecrets
-    invalid_tags: InvalidTagLimit
-
-    def result(self) -> DriveSignal:
-        """Verify the packets against the registry as it is now, and estimate the lane."""
-        upload, files = self.upload, self.files.result()
-        terms = packet_terms(upload.context.packets or {})
-        with self.database.read() as connection:
-            known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets), upload.again_id)
-        max_invalid_tags = self.invalid_tags.left(_holder(upload), upload.received_at)
-        read = read_packets_of(
-            files,
-            known,
-            terms,
-            max_invalid_tags,
-            received_at=upload.received_at,
-            observed_at=upload.observed_at,
-        )
-        lane = self.processes.run(
-            estimate_lane,
-            lane_markers(read.merged),
-            _left_out(read),
-            files.track,
-            terms,
-            _signals(read),
-            _posed_camera(files, upload.context),
-            wait_s=upload.wait_s,
-        )
-        return DriveSignal(files, read, lane)
-
-    def cancel(self) -> None:
-        """Stop the process."""
-        self.files.cancel()
 
 
 def _holder(upload: Upload) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
@@ -93,6 +93,7 @@ class OutdatedMatch(Exception):
     """What an upload was matched against has changed: it has to be matched anew."""
 
 
+ResultT = TypeVar("ResultT")
 SignalT = TypeVar("SignalT")
 
 
@@ -134,6 +135,22 @@ class UploadHandler(ABC, Generic[SignalT]):
     def plot(self, signal: SignalT) -> bytes | None:
         """A plot of the signal, SVG."""
         return None
+
+
+@dataclass(frozen=True, slots=True)
+class PendingSignal(Generic[ResultT, SignalT]):
+    """A task on its way through a decoder process, and the function that makes the signal from its result."""
+
+    pending: Pending[ResultT]
+    make_signal: Callable[[ResultT], SignalT]
+
+    def result(self) -> SignalT:
+        """Wait for the result, and make the signal; called again after an `OutdatedMatch`."""
+        return self.make_signal(self.pending.result())
+
+    def cancel(self) -> None:
+        """Stop the task."""
+        self.pending.cancel()
 
 
 # === The path.
