@@ -18,7 +18,6 @@ from app.formats.images import ImageLimits
 from app.geodesy import use_grids
 from app.jobs.decoder_process import ProcessLimits
 from app.jobs.export_process import ExportProcesses
-from app.jobs.frame_tasks import DecodePlates
 from app.jobs.pool import DecodePool
 from app.jobs.queues import JobEngine, LocalQueue
 from app.markers.plate import PlateGeometry
@@ -33,6 +32,7 @@ from app.services.access.keys import Agencies, Keys
 from app.services.blobs import UnusedBlobs
 from app.services.decodes.context import DecodeRules
 from app.services.decodes.decodes import DecodeDetails, Decodes
+from app.services.decodes.frame_tasks import DecodePlates
 from app.services.decodes.frames import ArchiveHandler, FrameHandler
 from app.services.decodes.outputs import DecodeOutputs
 from app.services.decodes.recordings import PacketHandler, TraceHandler

@@ -13,8 +13,8 @@ from app.errors import InvalidParameter, Unavailable
 from app.families.plate.frames import decode_plates
 from app.jobs.celery_queue import CeleryQueue
 from app.jobs.celery_worker import CeleryWorker
-from app.jobs.frame_tasks import DecodePlates
 from app.registry.database import Database, head_revision
+from app.services.decodes.frame_tasks import DecodePlates
 from app.services.jobs import QueueName
 from app.services.ports import utc_now
 from app.settings import Settings

@@ -24,9 +24,8 @@ from app.demo.drive import drive_over, list_plates, registered_code
 from app.demo.road_plan import ORIGIN_DEG, ROAD, RULES, plan_road
 from app.demo.server import LocalServer
 from app.formats.format import SpooledFile
-from app.jobs.drive_tasks import decode_recording
 from app.markers.magnet import InformationTag, Polarity, parse_tag
-from app.services.decodes.tasks import TraceTask
+from app.services.decodes.trace_tasks import decode_recording
 from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
@@ -122,7 +121,7 @@ def _write_trace() -> None:
         for name, data in write_recorder_files(drive.trace).items():
             archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
     (IMAGES / "drive.zip").write_bytes(packed.getvalue())
-    result = decode_recording(TraceTask("drive.zip", SpooledFile.of(packed.getvalue()), {}, (tag.text,)), None)
+    result = decode_recording("drive.zip", SpooledFile.of(packed.getvalue()), {}, (tag.text,))
     (IMAGES / "trace.svg").write_bytes(result.plot)
 
 

@@ -43,7 +43,7 @@ from app.families.documents import Flag, StrictModel
 from app.formats.format import SpooledFile
 from app.markers.snapshot import MEDIA_TYPE
 from app.sensors.camera import CalibrationBoard
-from app.services.fleet.calibrations import MAX_PHOTOS, Calibrations
+from app.services.fleet.calibrations import Calibrations
 from app.services.fleet.documents import (
     CalibrationDocument,
     CalibrationPage,
@@ -56,6 +56,7 @@ from app.services.fleet.documents import (
 )
 from app.services.fleet.snapshots import MAX_HOURS
 from app.services.fleet.snapshots import Snapshots as SnapshotsService
+from app.services.fleet.tasks import MAX_PHOTOS
 from app.services.fleet.vehicles import VehicleChange, Vehicles
 from app.services.idempotency import IdempotencyKey
 from app.services.markers.searches import parse_box

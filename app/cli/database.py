@@ -116,7 +116,7 @@ def perform(settings: Settings, name: str, values: Values, files: Sequence[int] 
 
 
 def _imports(settings: Settings, database: Database) -> Imports:
-    from app.jobs.tasks import SameProcess
+    from app.services.decoder_tasks import SameProcess
     from app.services.ports import utc_now
     from app.services.surveys.imports import Imports
     from app.wiring import marker_rules

@@ -179,7 +179,7 @@ def _write(console: Console, made: Plan, out: Path, options: OutputOptions, *, a
 
 def _read_face(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> Sequence[PlateReading]:
     """The plate decoder, imported with the first plate: it takes seconds."""
-    from app.jobs.plan_tasks import read_face
+    from app.services.plans.tasks import read_face
 
     return read_face(image, geometry)
 

@@ -118,27 +118,23 @@ def grade_print(
 
     from app.formats.format import SpooledFile
     from app.formats.images import ImageLimits
-    from app.jobs.picture_tasks import grade_photo
     from app.markers.plate import PlateCode, PlateScheme, recommended_geometry
     from app.planning.rules import CameraRules
-    from app.services.markers.tasks import PrintGradeTask
+    from app.services.markers.tasks import PrintedPlate, grade_photo
 
     if scheme not in list(PlateScheme):
         raise InvalidParameter(f"there is no scheme {scheme}", limit=", ".join(PlateScheme))
     geometry = recommended_geometry(PlateScheme(scheme), n=n, unit_mm=unit_mm, gap_mm=gap_mm)
     code = None if digits is None else PlateCode(digits, PlateScheme(scheme), geometry.n)
-    task = PrintGradeTask(
+    graded = grade_photo(
         SpooledFile.of(photo.read_bytes()),
         datetime.now(UTC),
-        code,
-        geometry,
-        None,
+        PrintedPlate(code, geometry),
         CameraRules(),
         speed_kmh,
         as_pdf=pdf is not None,
         limits=ImageLimits(pixels=read_settings().max_image_pixels),
     )
-    graded = grade_photo(task, None)
     if pdf is not None:
         pdf.write_bytes(graded.pdf)
     typer.echo(orjson.dumps(graded.document))
@@ -167,12 +163,12 @@ def decode_trace(
     from app.api.decodes.schemas import TraceIn
     from app.decoders.magnet.identify import match_tags
     from app.formats.format import SpooledFile
-    from app.jobs.drive_tasks import decode_recording
-    from app.services.decodes.tasks import TraceTask, trace_terms
+    from app.services.decodes.declarations import trace_terms
     from app.services.decodes.trace_documents import trace_document
+    from app.services.decodes.trace_tasks import decode_recording
 
     terms = read_declaration(TraceIn, declared, "docs/magnets.md").model_dump(exclude_unset=True)
-    result = decode_recording(TraceTask(recording.name, SpooledFile.at(recording), terms), None)
+    result = decode_recording(recording.name, SpooledFile.at(recording), terms)
     trace = match_tags(result.findings, (), trace_terms(terms).bar)
     if plot is not None:
         plot.write_bytes(result.plot)

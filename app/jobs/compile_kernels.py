@@ -15,12 +15,11 @@ from app.decoders.magnet.metro import cancel_wheel_noise
 from app.decoders.plate.detect_blobs import half_planes, ratio_signal
 from app.decoders.plate.reader import decode_plates
 from app.jobs.decoder_process import warm_frame
-from app.jobs.drive_tasks import compile_traces
 from app.lanes.control import Controller
 from app.lanes.lane_fit import assign_sides
 from app.lanes.least_squares import factor, inverse_band
 from app.sensors.camera import Camera
-from app.services.decodes.tasks import CompileTracesTask
+from app.services.decodes.trace_tasks import compile_traces
 from app.simulation.camera import render_plate_scene
 from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.road import Road
@@ -52,7 +51,7 @@ def _render_and_read_plate() -> None:
 
 def _read_trace_and_track() -> None:
     """Decode a trace, simulate one, cancel wheel noise, compute a lane's sides and steering, estimate a track."""
-    compile_traces(CompileTracesTask(), None)
+    compile_traces()
     simulate_drive(Scene(Road(40.0), Vehicle.compact(), Course()), np.random.default_rng(1))
     inverse_band(factor(np.array([[2.0] * 4, [1.0] * 4])))
     assign_sides(_STATIONS_M, np.resize((1.7, -1.7), 4), np.zeros(4, np.int64), wander=0.1, near_track=False)

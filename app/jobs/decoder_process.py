@@ -13,6 +13,7 @@ import signal
 import struct
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from multiprocessing.connection import Connection
@@ -24,9 +25,9 @@ import cv2
 import numpy as np
 
 from app.errors import ProcessStopped, WaymarkError
-from app.jobs.frame_tasks import DecodePlates, out_of_memory, ran_short, use_decoder
 from app.markers.plate import PlateCode
-from app.services.ports import Task
+from app.services.decoder_tasks import decoder_task, out_of_memory, ran_short
+from app.services.decodes.frame_tasks import DecodePlates, use_decoder
 
 # === What the kernel keeps a decoder process from: memory, files, processor time, the network, other folders' files.
 
@@ -167,41 +168,58 @@ _KEPT_BYTES = 256 * 1024**2
 _KEPT_BLOCK_BYTES = 32 * 1024**2  # glibc accepts no more
 
 
+class Placeholder(Enum):
+    """Stands for an argument that follows the others when the caller has set it."""
+
+    LATE = "late"
+
+
+class _LateArgument:
+    """A late argument as the task sees it (`app.services.ports.Later`)."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection: Connection | None = connection
+        self._value: object = None
+
+    def result(self) -> object:
+        """Wait until the caller sends it."""
+        if self._connection is not None:
+            self._value, self._connection = self._connection.recv(), None
+        return self._value
+
+
 def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLimits, folder: Path) -> None:
     """Load everything, work in a folder, send `READY`, and answer tasks until the server closes the connection.
 
-    A task comes in steps: (argument, whether it is the last). The function of the argument's type is called with it and
-    the result of the step before. The answer is (an `Outcome`, result or exception, name and times of each step).
+    A task comes as (function, arguments), followed by its late arguments in their order. The answer is (an `Outcome`,
+    result or exception, when the task began and ended [ns]).
     """
-    from app.jobs.tasks import STEPS  # only here: it loads every decoder
-
     end_with_parent()
     warm_process(decode)
     work_in(folder)
     limit_resources(limits)
     connection.send(READY if close_network() else READY_WITH_NETWORK)
-    answer: tuple[Outcome, Any] = (Outcome.DONE, None)
-    times_ns: list[tuple[str, int, int]] = []
-    while True:
-        try:
-            argument, is_last = connection.recv()
-        except EOFError:
-            return
-        began_ns, function = time.time_ns(), STEPS[type(argument)]
-        if answer[0] is Outcome.DONE:
-            allow_processor_time(limits)
-            try:
-                answer = (Outcome.DONE, function(argument, answer[1]))
-            except Exception as error:  # noqa: BLE001 - raised again in the server
-                outcome = Outcome.RAN_SHORT if ran_short(error) else Outcome.FAILED
-                raised = _met_limit(error, outcome) or error
-                answer = (outcome, ExceptionWithTraceback(raised, error.__traceback__))
-        times_ns.append((function.__name__, began_ns, time.time_ns()))
-        if is_last:
-            empty_folder(folder)
-            connection.send((*answer, times_ns))
-            answer, times_ns = (Outcome.DONE, None), []
-        del argument  # a frame's memory is free before the next frame comes
+    with suppress(EOFError):
+        while True:
+            connection.send(_carry_out(connection, limits, folder))
+
+
+def _carry_out(connection: Connection, limits: ProcessLimits, folder: Path) -> tuple[Outcome, object, tuple[int, int]]:
+    """Receive a task and carry it out. A frame's memory is free when this returns, before the next frame comes."""
+    function, sent = connection.recv()
+    began_ns = time.time_ns()
+    arguments = [_LateArgument(connection) if argument is Placeholder.LATE else argument for argument in sent]
+    allow_processor_time(limits)
+    try:
+        outcome, answer = Outcome.DONE, function(*arguments)
+    except Exception as error:  # noqa: BLE001 - raised again in the server
+        outcome = Outcome.RAN_SHORT if ran_short(error) else Outcome.FAILED
+        answer = ExceptionWithTraceback(_met_limit(error, outcome) or error, error.__traceback__)
+    for argument in arguments:
+        if isinstance(argument, _LateArgument):
+            argument.result()  # the caller sends it also where the function did not get as far
+    empty_folder(folder)
+    return outcome, answer, (began_ns, time.time_ns())
 
 
 def _met_limit(error: Exception, outcome: Outcome) -> ProcessStopped | None:
@@ -248,14 +266,9 @@ def keep_memory() -> None:
         mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
-class ProcessIdTask(Task[int]):
-    """Nothing to decode: the answer shows that a process is ready."""
-
-    is_long = False
-
-
-def process_id(_task: ProcessIdTask, _before: None) -> int:
-    """Id of the process."""
+@decoder_task("nothing", "try again", is_long=False)
+def process_id() -> int:
+    """Id of the process: the answer shows that it is ready."""
     return os.getpid()
 
 

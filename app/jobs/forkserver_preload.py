@@ -14,8 +14,37 @@ import gc
 import os
 import signal
 import sys
+from importlib import import_module
 
 _CHECK_S = 0.5
+TASKS = (
+    "app.services.decodes.frame_tasks",
+    "app.services.decodes.packet_tasks",
+    "app.services.decodes.trace_tasks",
+    "app.services.decodes.video_tasks",
+    "app.services.drives.tasks",
+    "app.services.fleet.tasks",
+    "app.services.markers.tasks",
+    "app.services.plans.tasks",
+    "app.services.public_pages.tasks",
+    "app.services.surveys.tasks",
+)
+DECODERS = (
+    "app.decoders.magnet.decoder",
+    "app.decoders.magnet.recording_check",
+    "app.decoders.plate.print_grade",
+    "app.decoders.plate.reader",
+    "app.decoders.plate.video_search",
+    "app.lanes.estimate",
+    "app.planning.build_alignment",
+    "app.planning.planner",
+    "app.planning.predict.printed_plate",
+    "app.planning.proof.prove",
+    "app.plots.print_report",
+    "app.simulation.magnetic.dipoles",
+    "app.simulation.steering",
+)
+"""What tasks import when they run, without what is too large or too rare for a process to have it from its start."""
 
 
 def end_with_parent() -> None:
@@ -31,12 +60,13 @@ def end_with_parent() -> None:
 
 
 def load_decoders() -> None:
-    """Import the tasks, and run the plate decoder once; garbage collection in a fork then leaves all of it alone."""
+    """Import all, and run the plate decoder once; garbage collection in a fork then leaves all of it alone."""
     gc.disable()  # it would free nothing and take a fifth of the time
     from app.families.plate.frames import decode_plates
-    from app.jobs import tasks  # noqa: F401 - for the forks
     from app.jobs.decoder_process import warm_process
 
+    for name in (*TASKS, *DECODERS):
+        import_module(name)
     gc.enable()
     warm_process(decode_plates)
 

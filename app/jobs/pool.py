@@ -21,7 +21,7 @@ from functools import cache
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, TypeVarTuple
 
 import structlog
 
@@ -32,17 +32,18 @@ from app.jobs.decoder_process import (
     READY,
     READY_WITH_NETWORK,
     Outcome,
-    ProcessIdTask,
+    Placeholder,
     ProcessLimits,
     delete_folders_of_the_dead,
     new_folder,
+    process_id,
     serve_tasks,
 )
-from app.jobs.frame_tasks import DecodePlates
 from app.jobs.queues import FairQueue
 from app.registry.engines import EVERY_AGENCY, whose_rows
-from app.services.decodes.tasks import CompileTracesTask
-from app.services.ports import Task
+from app.services.decoder_tasks import is_long_task
+from app.services.decodes.frame_tasks import DecodePlates
+from app.services.decodes.trace_tasks import compile_traces
 from app.services.request_work import add_processor_time, check_deadline, current_work
 
 # === Places of tasks in the decoder processes or before them: no agency takes all of them from the others.
@@ -145,8 +146,9 @@ class Pending(Generic[T]):
 
     Parameters
     ----------
-    steps : tuple of object
-        Arguments of the task's steps (`app.jobs.tasks.STEPS`). One may be a Future that the caller has yet to set.
+    task : callable
+    arguments : tuple of object
+        One may be a Future that the caller has yet to set.
     interrupt : callable
         Stops the process that works on this, if one does.
     timeout_s : float
@@ -162,10 +164,16 @@ class Pending(Generic[T]):
     """
 
     def __init__(
-        self, steps: tuple[object, ...], interrupt: Callable[[Pending[Any]], None], timeout_s: float,
-        agency_id: str = "", *, is_job: bool = False,
-    ) -> None:  # fmt: skip
-        self.steps = steps
+        self,
+        task: Callable[..., T],
+        arguments: tuple[object, ...],
+        interrupt: Callable[[Pending[Any]], None],
+        timeout_s: float,
+        agency_id: str = "",
+        *,
+        is_job: bool = False,
+    ) -> None:
+        self.task, self.arguments = task, arguments
         self.agency_id, self.is_job = agency_id, is_job
         self.future: Future[T] = Future()
         self.timeout_s = timeout_s
@@ -196,7 +204,7 @@ class Pending(Generic[T]):
     def cancel(self) -> None:
         """Stop it, also when it runs already."""
         self.stopped = True
-        for argument in self.steps:
+        for argument in self.arguments:
             if isinstance(argument, Future):
                 argument.cancel()
         if not self.future.cancel():
@@ -313,13 +321,14 @@ class WorkerSupervisor(threading.Thread):
             self._current = pending
         started_s = time.monotonic()
         try:
-            for number, step in enumerate(pending.steps, 1):
-                argument = self._wait_for(step) if isinstance(step, Future) else step
-                connection.send((argument, number == len(pending.steps)))
+            late = [argument for argument in pending.arguments if isinstance(argument, Future)]
+            sent = [Placeholder.LATE if isinstance(argument, Future) else argument for argument in pending.arguments]
+            connection.send((pending.task, sent))
+            for argument in late:
+                connection.send(self._wait_for(argument))
             if connection.poll(pending.timeout_s):
                 outcome, result, times_ns = connection.recv()
-                for (name, *between), step in zip(times_ns, pending.steps, strict=True):
-                    tracing.record(name, pending.traceparent, tuple(between), task=type(step).__name__)
+                tracing.record(pending.task.__name__, pending.traceparent, times_ns)
                 return outcome, result
         finally:
             pending.used_s += time.monotonic() - started_s
@@ -415,6 +424,7 @@ def _was_stopped() -> Unavailable:
 # === Decoder processes.
 
 
+ArgumentsT = TypeVarTuple("ArgumentsT")
 ResultT = TypeVar("ResultT")
 
 
@@ -471,7 +481,7 @@ class DecodePool:
         """
         with self._lock:
             self._start_supervisors()
-        self.submit(CompileTracesTask())
+        self.submit(compile_traces)
 
     def open(self) -> None:
         """Start the processes and wait until one is ready.
@@ -481,7 +491,7 @@ class DecodePool:
         Unavailable
             None could be started.
         """
-        self.submit(ProcessIdTask()).result()
+        self.run(process_id)
 
     def close(self) -> None:
         """Stop the processes, also in the middle of a task."""
@@ -510,14 +520,16 @@ class DecodePool:
         starts = sum(supervisor.starts for supervisor in supervisors)
         return PoolState(len(running), self._workers, memory_bytes, len(self._tasks), starts)
 
-    def submit(self, task: Task[ResultT], *, wait_s: float = 0.0) -> Pending[ResultT]:
+    def submit(
+        self, task: Callable[[*ArgumentsT], ResultT], *arguments: *ArgumentsT, wait_s: float = 0.0
+    ) -> Pending[ResultT]:
         """As `DecoderProcesses.submit`; `Unavailable` also where the pool was closed."""
         agency_id = whose_rows()
         self._places.take(agency_id, wait_s)
-        timeout_s = self._limits.trace_timeout_s if task.is_long else self._limits.timeout_s
+        timeout_s = self._limits.trace_timeout_s if is_long_task(task) else self._limits.timeout_s
         work = current_work()
         pending: Pending[ResultT] = Pending(
-            task.steps(), self._interrupt, timeout_s, agency_id, is_job=work is not None and work.is_job
+            task, arguments, self._interrupt, timeout_s, agency_id, is_job=work is not None and work.is_job
         )
         pending.future.add_done_callback(lambda _future: self._places.give_back(agency_id))
         with self._lock:
@@ -527,6 +539,10 @@ class DecodePool:
             self._start_supervisors()
             self._tasks.put(agency_id, pending, is_job=pending.is_job)
         return pending
+
+    def run(self, task: Callable[[*ArgumentsT], ResultT], *arguments: *ArgumentsT, wait_s: float = 0.0) -> ResultT:
+        """As `DecoderProcesses.run`."""
+        return self.submit(task, *arguments, wait_s=wait_s).result()
 
     def _interrupt(self, pending: Pending[Any]) -> None:
         for supervisor in self._supervisors:

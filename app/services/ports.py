@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import Protocol, TypeVar, TypeVarTuple
 
 from app.formats.format import SpooledFile
 from app.registry.jobs import JobKind
 
-# === Decoder processes as the services see them: a task goes in, its result comes out, and nothing else passes between.
+# === Decoder processes: the use cases submit functions to them, which `app.services.decoder_tasks` describes.
 
 
+ArgumentsT = TypeVarTuple("ArgumentsT")
 ResultT = TypeVar("ResultT")
 ResultT_co = TypeVar("ResultT_co", covariant=True)
 
 
-class Task(Generic[ResultT]):
-    """Base of everything that a decoder process is asked to do: plain values that can be pickled, and no database.
+class Later(Protocol[ResultT_co]):
+    """An argument of a task that follows it to the decoder process: in the caller, a `Future` that it sets."""
 
-    `app.jobs.tasks` names the function that carries each task out.
-    """
-
-    __slots__ = ()
-    is_long: ClassVar[bool] = True  # whether the time limit of recordings applies to it, instead of the limit of frames
-
-    def steps(self) -> tuple[object, ...]:
-        """Arguments of the task's steps, in their order; one that is a Future is sent when the caller has set it."""
-        return (self,)
+    def result(self) -> ResultT_co:
+        """Wait for the argument."""
 
 
 class Pending(Protocol[ResultT_co]):
@@ -53,12 +47,17 @@ class Pending(Protocol[ResultT_co]):
 class DecoderProcesses(Protocol):
     """Processes with limits on memory and time."""
 
-    def submit(self, task: Task[ResultT], *, wait_s: float = 0.0) -> Pending[ResultT]:
+    def submit(
+        self, task: Callable[[*ArgumentsT], ResultT], *arguments: *ArgumentsT, wait_s: float = 0.0
+    ) -> Pending[ResultT]:
         """Hand a task over and return.
 
         Parameters
         ----------
-        task : Task
+        task : function of a module
+        arguments
+            Plain values that can be pickled. A `Future` follows when the caller has set it; until the function asks
+            for its result, it works on the others.
         wait_s : float, optional
             How long to wait for a place. [s]
 
@@ -68,8 +67,11 @@ class DecoderProcesses(Protocol):
             Too many tasks are waiting already.
         """
 
+    def run(self, task: Callable[[*ArgumentsT], ResultT], *arguments: *ArgumentsT, wait_s: float = 0.0) -> ResultT:
+        """Hand a task over as `submit`, and wait for its result as `Pending.result`."""
 
-# === What the use cases need from outside; app/wiring.py wires it.
+
+# === Time, blobs and queues.
 
 
 class Clock(Protocol):

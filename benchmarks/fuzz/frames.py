@@ -14,7 +14,7 @@ from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.jobs.pool import DecodePool
-from app.services.decodes.tasks import FramePicture, FrameSearch, FrameTask
+from app.services.decodes.frame_tasks import FramePicture, FrameSearch, decode_frame
 from benchmarks.fuzz.parsers import Outcome
 from benchmarks.fuzz.pictures import list_pictures
 
@@ -45,8 +45,8 @@ def attack_frames(count: int, *, workers: int = 2, seed: int = 1) -> Outcome:
 
 def _submit(pool: DecodePool, data: bytes) -> Any:
     search: Future[FrameSearch] = Future()
-    search.set_result(FrameSearch({PLATE.name: PlateSearch()}))
-    return pool.submit(FrameTask(FramePicture(SpooledFile.of(data)), search), wait_s=60.0)
+    search.set_result({PLATE.name: PlateSearch()})
+    return pool.submit(decode_frame, FramePicture(SpooledFile.of(data)), search, wait_s=60.0)
 
 
 def _collect(found: Outcome, data: bytes, began_s: float, pending: Any) -> None:

@@ -19,9 +19,9 @@ from app.families.surveys import MarkerRules
 from app.formats.format import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
-from app.jobs.tasks import SameProcess
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope
+from app.services.decoder_tasks import SameProcess
 from app.services.surveys.import_report import ImportInput, ImportReport
 from app.services.surveys.imports import Imports
 from app.surveys.georeference import east_north_m, georeference_survey

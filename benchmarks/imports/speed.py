@@ -148,10 +148,10 @@ def main() -> None:
     from app.families.surveys import MarkerRules
     from app.formats.format import SpooledFile
     from app.formats.surveys.declaration import ImportDeclaration
-    from app.jobs.tasks import SameProcess
     from app.registry.database import Database
     from app.registry.markers import MarkerFilter
     from app.services.access.access import Access, Scope
+    from app.services.decoder_tasks import SameProcess
     from app.services.surveys.exports import Exports
     from app.services.surveys.import_report import ImportInput
     from app.services.surveys.imports import Imports

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from app.families.surveys import MarkerRules
 from app.formats.format import SpooledFile
-from app.jobs.tasks import SameProcess
 from app.planning.alignment import AlignmentDeclaration
 from app.registry.database import Database
 from app.registry.engines import across_agencies
 from app.services.access.access import Access, Scope
+from app.services.decoder_tasks import SameProcess
 from app.services.plans.alignments import Alignments
 from app.services.plans.plans import Plans
 from app.storage.blobs import Blobs

@@ -23,7 +23,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from app.formats.format import SpooledFile
-from app.jobs.drive_tasks import decode_recording
 from app.registry import agencies, jobs
 from app.registry import decodes as store
 from app.registry.column_types import new_id
@@ -31,7 +30,7 @@ from app.registry.database import Database
 from app.registry.decodes import DecodeRow
 from app.registry.engines import acting_for
 from app.registry.jobs import JobKind, new_job
-from app.services.decodes.tasks import TraceTask
+from app.services.decodes.trace_tasks import decode_recording
 from benchmarks.service.throughput import PROCESSES, make_frames, measure_bare
 
 VEHICLES = 10_000
@@ -145,7 +144,7 @@ def jobs_per_s(url: str, processes: int, seconds: float) -> float:
 
 def _recording_h(data: bytes) -> float:
     """Length of the recording that is decoded. [h]"""
-    result = decode_recording(TraceTask("drive.zip", SpooledFile.of(data), {}), None)
+    result = decode_recording("drive.zip", SpooledFile.of(data), {})
     return result.report.duration_s / 3600
 
 

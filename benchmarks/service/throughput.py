@@ -33,10 +33,9 @@ from app.decoders.plate.reader import decode_plates
 from app.formats.format import SpooledFile
 from app.formats.images import load_image
 from app.jobs.decoder_process import ONE_THREAD, keep_memory
-from app.jobs.drive_tasks import decode_recording
 from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.sensors.camera import Camera
-from app.services.decodes.tasks import TraceTask
+from app.services.decodes.trace_tasks import decode_recording
 from benchmarks.faults.server import FaultServer
 from benchmarks.http_overhead import CAMERA, LAT_DEG, LON_DEG, STEP_DEG, frame_1080p
 from benchmarks.service.processor_time import ProcessorTime, counted
@@ -101,7 +100,7 @@ def _bare_frames(files: Sequence[bytes]) -> Callable[[bytes], object]:
 
 def _bare_traces(files: Sequence[bytes]) -> Callable[[bytes], object]:
     def decode(data: bytes) -> object:
-        return decode_recording(TraceTask("drive.zip", SpooledFile.of(data), {}), None)
+        return decode_recording("drive.zip", SpooledFile.of(data), {})
 
     decode(files[0])
     return decode

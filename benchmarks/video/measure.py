@@ -17,10 +17,9 @@ from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.video_file import VideoFile, VideoKind
-from app.jobs.video_tasks import decode_segment, index_frames
 from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.sensors.camera import Camera
-from app.services.decodes.tasks import IndexVideoTask, SegmentTask
+from app.services.decodes.video_tasks import decode_segment, index_frames
 from benchmarks.video.drive import PassedPlate
 
 
@@ -58,12 +57,12 @@ def measure_video(
 ) -> VideoScore:
     """Decode a video and compare what was read with the truth."""
     began_s = time.process_time()
-    index = index_frames(IndexVideoTask(VideoFile(SpooledFile.at(path), VideoKind.MP4)), None)
+    index = index_frames(VideoFile(SpooledFile.at(path), VideoKind.MP4))
     score = VideoScore(frames=len(index.stamps))
     found: list[FoundPlate] = []
     wanted = {PLATE.name: PlateSearch(camera, tuple(codebook), EXPECTED_GEOMETRIES)}
     for number in range(len(index.segments)):
-        result = decode_segment(SegmentTask(index, number, wanted), None)
+        result = decode_segment(index, number, wanted)
         score.decoded += result.decoded
         score.codec_s += result.load_ms / 1e3
         found += result.plates

@@ -19,10 +19,10 @@ from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.video_file import VideoFile, VideoKind
-from app.jobs.decoder_process import ProcessIdTask
+from app.jobs.decoder_process import process_id
 from app.jobs.pool import DecodePool
 from app.markers.plate import EXPECTED_GEOMETRIES
-from app.services.decodes.tasks import IndexVideoTask, SegmentTask
+from app.services.decodes.video_tasks import decode_segment, index_frames
 from benchmarks.video.drive import CAMERA, DriveShape, write_drive
 
 SPEED_M_S, SPACING_M, RATE_HZ = 25.0, 5.0, 30.0
@@ -68,7 +68,7 @@ def main() -> None:
                 except Exception as error:  # noqa: BLE001 - every failure is counted
                     why = f"{type(error).__name__}: {str(error)[:80]}"
                     failures[why] = failures.get(why, 0) + 1
-                uses.append(ProcessUse.of(pool.submit(ProcessIdTask()).result()))
+                uses.append(ProcessUse.of(pool.run(process_id)))
                 if number % 50 == WARM:
                     print(number, uses[-1], sum(failures.values()), "failures", file=sys.stderr, flush=True)
             starts = pool.describe().starts
@@ -90,10 +90,10 @@ def main() -> None:
 
 
 def _decode(pool: DecodePool, path: Path) -> None:
-    index = pool.submit(IndexVideoTask(VideoFile(SpooledFile.at(path), VideoKind.MP4))).result()
+    index = pool.run(index_frames, VideoFile(SpooledFile.at(path), VideoKind.MP4))
     wanted = {PLATE.name: PlateSearch(CAMERA, (), EXPECTED_GEOMETRIES)}
     for number in range(len(index.segments)):
-        pool.submit(SegmentTask(index, number, wanted)).result()
+        pool.run(decode_segment, index, number, wanted)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import pkgutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import app
+from app.jobs.forkserver_preload import DECODERS, TASKS
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = (
@@ -56,18 +58,32 @@ def test_a_server_loads_decoders_and_simulations_only_when_it_needs_one(tmp_path
     """
     program = """
 import sys
+from app.jobs.forkserver_preload import DECODERS
 from app.main import create_app
 from app.settings import Settings
 app = create_app(Settings(data_dir="."))
 app.state.database.migrate()
-late = {"numba", "app.jobs.tasks", "app.decoders.plate.reader", "scipy.stats", "scipy.signal", "scipy.optimize",
-    "scipy.spatial", "pyogrio", "pyarrow", "ezdxf", "celery", "boto3", "psycopg", "jwt", "httpx", "gpxpy",
-    "jinja2", "pynmeagps", "av", "mcap", "rosbags", "typer", "alembic"}
+late = {"numba", *DECODERS, "scipy.stats", "scipy.signal", "scipy.optimize",
+    "scipy.spatial", "pyogrio", "pyarrow", "ezdxf", "reportlab", "celery", "boto3", "psycopg", "jwt", "httpx", "gpxpy",
+    "pynmeagps", "av", "mcap", "rosbags", "typer", "alembic"}
 print(late & set(sys.modules), [route.path for route in app.routes if "dependant" in vars(route)])
 """
     for loaded in ("{'alembic'} []", "set() []"):
         run = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
         assert run.stdout.strip() == loaded
+
+
+def test_decoder_processes_have_what_their_tasks_import_from_their_start() -> None:
+    """A module that one of them imported in a task would take its time and memory in each process."""
+    rare = {"app.decoders.magnet.metro", "app.plots.track", "app.tracks.estimate", "app.tracks.files"}
+    tasks = [path for path in (ROOT / "app/services").rglob("*tasks.py") if path.name != "decoder_tasks.py"]
+    assert {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in tasks} == set(TASKS)
+    steps = [step for path in tasks for step in ast.parse(path.read_text("utf-8")).body]
+    functions = [step for step in steps if isinstance(step, ast.FunctionDef | ast.ClassDef)]
+    imports = [node for step in functions for node in ast.walk(step) if isinstance(node, ast.ImportFrom)]
+    assert len(imports) > 10
+    names = {(node.module, f"{node.module}.{alias.name}") for node in imports for alias in node.names}
+    assert {module for module, name in names if not {module, name} & {*DECODERS, *rare}} == set()
 
 
 @pytest.mark.slow

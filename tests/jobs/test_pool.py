@@ -25,8 +25,15 @@ from app.jobs.decoder_process import ProcessLimits
 from app.jobs.pool import DecodePool, Pending, WorkerSupervisor
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
+from app.plots.annotated_frame import Outline
 from app.registry.engines import acting_for
-from app.services.decodes.tasks import AnnotationTask, FramePicture, FrameResult, FrameSearch, FrameTask, Outline
+from app.services.decodes.frame_tasks import (
+    FramePicture,
+    FrameResult,
+    FrameSearch,
+    annotate_frame,
+    decode_frame,
+)
 from tests.formats.pictures import huge_png, jpeg, lying_png, png
 from tests.http import wait_until
 from tests.jobs import standin
@@ -44,7 +51,7 @@ def pool() -> Iterator[DecodePool]:
 
 def known(search: PlateSearch) -> Future[FrameSearch]:
     future: Future[FrameSearch] = Future()
-    future.set_result(FrameSearch({"plate": search}))
+    future.set_result({"plate": search})
     return future
 
 
@@ -53,7 +60,7 @@ def start(pool: DecodePool, what: int) -> Pending[FrameResult]:
 
 
 def submit(pool: DecodePool, data: bytes, search: Future[FrameSearch]) -> Pending[FrameResult]:
-    return pool.submit(FrameTask(FramePicture(SpooledFile.of(data)), search))
+    return pool.submit(decode_frame, FramePicture(SpooledFile.of(data)), search)
 
 
 def child_of(pool: DecodePool) -> int:
@@ -322,7 +329,7 @@ def test_the_picture_is_loaded_before_the_search_is_known(pool: DecodePool) -> N
     pending = submit(pool, png(standin.frame_that(standin.OBEY)), search)
     wait_until(pending.future.running, "a process to take the picture")
     assert not pending.future.done()
-    search.set_result(FrameSearch({"plate": PlateSearch(codebook=(CODE,))}))
+    search.set_result({"plate": PlateSearch(codebook=(CODE,))})
     assert pending.result().readings[0].digits == CODE.digits
 
 
@@ -410,7 +417,7 @@ def test_annotation(pool: DecodePool, suffix: str) -> None:
     frame = np.full((240, 320, 3), 128, np.uint8)
     outline = Outline(((100, 100), (200, 100), (200, 180), (100, 180)), "read", "023792168411 99 %")
     far = Outline(((-1e9, 0), (10, 0), (10, 1e9), (0, 10)), "unsure", "?")
-    drawn = pool.submit(AnnotationTask(SpooledFile.of(jpeg(frame)), (outline, far), suffix)).result()
+    drawn = pool.run(annotate_frame, FramePicture(SpooledFile.of(jpeg(frame))), (outline, far), suffix)
     assert drawn.startswith({"png": b"\x89PNG", "jpg": b"\xff\xd8"}[suffix])
     pixels = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
     assert pixels.shape == (240, 320, 3)

@@ -25,7 +25,7 @@ from app.jobs import decoder_process
 from app.jobs.decoder_process import ProcessLimits
 from app.jobs.pool import DecodePool
 from app.markers.reading import PlateOutcome, PlateReading
-from app.services.decodes.tasks import FramePicture, FrameSearch, FrameTask
+from app.services.decodes.frame_tasks import FramePicture, FrameSearch, decode_frame
 from tests.formats.pictures import png
 from tests.jobs import standin
 
@@ -84,9 +84,9 @@ def attempt_all(pixels: Any, **_options: Any) -> list[PlateReading]:
 
 def attempt(pool: DecodePool) -> dict[str, Any]:
     search: Future[FrameSearch] = Future()
-    search.set_result(FrameSearch({"plate": PlateSearch()}))
-    frame = FrameTask(FramePicture(SpooledFile.of(png(standin.frame_that(standin.OBEY)))), search)
-    return dict(json.loads(pool.submit(frame).result().readings[0].reason))
+    search.set_result({"plate": PlateSearch()})
+    picture = FramePicture(SpooledFile.of(png(standin.frame_that(standin.OBEY))))
+    return dict(json.loads(pool.run(decode_frame, picture, search).readings[0].reason))
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ from app.api.surveys.schemas import DeclarationIn
 from app.errors import InvalidParameter
 from app.families.surveys import MarkerRules
 from app.formats.format import SpooledFile
-from app.jobs.tasks import SameProcess
 from app.registry.database import Database
 from app.registry.engines import seeing_every_agency
 from app.registry.marker_rows import markers
 from app.services.access.access import Access, Scope
+from app.services.decoder_tasks import SameProcess
 from app.services.ports import utc_now
 from app.services.surveys.import_report import ImportReport, import_input
 from app.services.surveys.imports import SETTLED, Imports

@@ -26,11 +26,11 @@ from app.api.http.strict_json import StrictRoute
 from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
-from app.services.decodes.decodes import DecodeDetails
+from app.services.decodes.decodes import DecodeDetails, PacketsDocument
 from app.services.decodes.decodes import Decodes as DecodesService
+from app.services.decodes.documents import DecodeDocument, DecodePage
 from app.services.decodes.outputs import DecodeOutputs
-from app.services.decodes.tasks import MAX_POINTS, MAX_SERIES, PacketsDocument, SamplesDocument
-from app.services.decodes.upload_path import DecodeDocument, DecodePage
+from app.services.decodes.trace_tasks import MAX_POINTS, MAX_SERIES, SamplesDocument
 
 router = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
 

@@ -18,7 +18,7 @@ from app.formats.video_file import VideoLimits
 from app.geodesy import check_lon_lat
 from app.registry.decodes import DecodeRow
 from app.sensors.camera import Camera
-from app.services.decodes.tasks import frame_terms, packet_terms, trace_terms
+from app.services.decodes.declarations import frame_terms, packet_terms, trace_terms
 
 # === Kinds of decodes.
 
@@ -260,11 +260,12 @@ class DecodeContext:
     thermal: bool = False
     thermal_range: tuple[float, float] | None = None  # [counts] counts that become 0 and 255 in 16-bit thermal frames
     captured_at: datetime | None = None  # aware
-    # the upload is a magnetometer trace, declared like this (`app.services.decodes.tasks.trace_terms`)
+    # the upload is a magnetometer trace, declared like this (`app.services.decodes.declarations.trace_terms`)
     trace: dict[str, Any] | None = None
-    # the upload is a packet log, declared like this (`app.services.decodes.tasks.packet_terms`)
+    # the upload is a packet log, declared like this (`app.services.decodes.declarations.packet_terms`)
     packets: dict[str, Any] | None = None
-    # frame rate, list and track of the frames of a drive, declared like this (`app.services.decodes.tasks.frame_terms`)
+    # frame rate, list and track of the frames of a drive, declared like this
+    # (`app.services.decodes.declarations.frame_terms`)
     frames: dict[str, Any] | None = None
     # id, name and version of the vehicle, and the source of each member (`app.services.fleet.vehicles.inherit`)
     vehicle: dict[str, Any] | None = None

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-import sqlalchemy as sa
+from typing_extensions import TypedDict
 
 from app.decoders.cerpm.merge import vehicle_positions
 from app.decoders.cerpm.verify import decode_message
@@ -19,42 +18,19 @@ from app.registry import jobs
 from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.decodes import DecodeFilter, DecodeRow
-from app.registry.jobs import JobKind, new_job
 from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
-from app.services.blobs import staged
 from app.services.decodes.context import ContextInput, DecodeKind, DecodeRules, context_from_document
-from app.services.decodes.frame_documents import FramesResult
+from app.services.decodes.documents import DecodeDocument, DecodeHead, decode_document, decode_head
 from app.services.decodes.frame_poses import track_csv, track_geojson, track_gpx, track_points
 from app.services.decodes.outputs import readings_csv, readings_geojson
 from app.services.decodes.packet_documents import MAX_REFUSED
-from app.services.decodes.tasks import (
-    DEFAULT_SERIES,
-    MAX_PACKETS,
-    MAX_POINTS,
-    MAX_SERIES,
-    DriveTask,
-    PacketsDocument,
-    SamplesDocument,
-    SamplesTask,
-    VehicleTrackDocument,
-)
-from app.services.decodes.upload_path import (
-    DecodeDocument,
-    DecodeHead,
-    NewRecord,
-    QueuedRecord,
-    Upload,
-    UploadHandler,
-    UploadPath,
-    decode_document,
-    decode_head,
-    new_decode,
-    with_upload,
-)
-from app.services.fleet.vehicles import count_upload, resolve_context
-from app.services.idempotency import IdempotencyKey, find_response, write_once
+from app.services.decodes.packet_tasks import read_drive
+from app.services.decodes.trace_tasks import DEFAULT_SERIES, MAX_POINTS, MAX_SERIES, SamplesDocument, read_samples
+from app.services.decodes.upload_path import Upload, UploadHandler, UploadPath
+from app.services.fleet.vehicles import resolve_context
+from app.services.idempotency import IdempotencyKey, find_response
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue
 from app.services.uploads.quotas import Quotas
@@ -93,10 +69,8 @@ class Decodes:
         rules: DecodeRules | None = None,
     ) -> None:
         self._database, self._clock = database, clock
-        self._blobs, self._quotas, self._queue = blobs, quotas, queue
-        self._handlers = handlers
-        self._rules = rules or DecodeRules()
-        self._path = UploadPath(database, blobs)
+        self._blobs, self._handlers = blobs, handlers
+        self._path = UploadPath(database, clock, blobs, quotas, queue, (rules or DecodeRules()).idempotency_ttl)
 
     # --- uploads ------------------------------------------------------------------------------------------------------
 
@@ -135,33 +109,8 @@ class Decodes:
         handler = next(handler for handler in self._handlers if handler.accepts(context, file))
         upload = Upload(caller.agency_id, author_of(caller), file, context, now)
         if handler.is_job(file) or as_job:
-            return self._put_in_queue(caller, upload, handler, key)
-        record = NewRecord(
-            caller, handler, upload, self._clock, quotas=self._quotas, key=key, ttl=self._rules.idempotency_ttl
-        )
-        self._path.decode(upload, handler, record)
-        return record.response, record.replayed
-
-    def _put_in_queue(
-        self, caller: Caller, upload: Upload, handler: UploadHandler[Any], key: IdempotencyKey | None
-    ) -> tuple[DecodeDocument, bool]:
-        agency_id, now, ttl = caller.agency_id, upload.received_at, self._rules.idempotency_ttl
-        with staged(self._blobs) as stage:
-            row = with_upload(new_decode(handler, upload), stage, upload)
-            with write_once(self._database, agency_id, key, now, ttl) as (connection, answer):
-                if answer.replayed:
-                    return answer.response, True
-                self._quotas.count(connection, caller, upload.file.size)
-                store.add_decode(connection, agency_id, caller.key_id, row)
-                jobs.add_job(
-                    connection,
-                    new_job(JobKind.DECODE, row.id, agency_id, caller.key_id, now, job_input={"label": caller.label}),
-                )
-                count_upload(connection, agency_id, row.id, upload.context, now)
-                document = answer.store(decode_document(row))
-            stage.keep()
-        self._queue.submit(row.id, agency_id, JobKind.DECODE)
-        return document, False
+            return self._path.put_in_queue(caller, upload, handler, key)
+        return self._path.decode_now(caller, upload, handler, key)
 
     def run(self, job: RunningJob) -> None:
         """Decode an upload that was queued; the handler of jobs of the kind `JobKind.DECODE`."""
@@ -170,20 +119,10 @@ class Decodes:
         assert row.upload_key is not None
         handler = next(handler for handler in self._handlers if handler.kind == row.kind)
         with self._blobs.opened(row.upload_key) as file:
-            upload = Upload(
-                job.row.agency_id, Author(job.row.input.get("label", ""), job.row.holder_id), file,
-                context_from_document(row.context), row.created_at,
-                wait_s=_WAIT_S, report_progress=partial(_report, job), report_part=partial(self._keep_part, job),
-            )  # fmt: skip
-            self._path.decode(upload, handler, QueuedRecord(job, upload, self._clock))
-
-    def _keep_part(self, job: RunningJob, done: int, total: int, part: FramesResult) -> None:
-        """Store the result so far."""
-
-        def keep(connection: sa.Connection) -> None:
-            store.store_part(connection, job.row.agency_id, job.row.id, part)
-
-        job.report_progress(done / total, steps=(done, total), keep=keep, resumable=False)
+            author = Author(job.row.input.get("label", ""), job.row.holder_id)
+            context = context_from_document(row.context)
+            upload = Upload(job.row.agency_id, author, file, context, row.created_at, wait_s=_WAIT_S, job=job)
+            self._path.decode_queued(job, upload, handler)
 
     def decode_again(self, agency_id: str, decode_id: str) -> tuple[dict[str, Any], bytes | None]:
         """The result of a stored upload by the present decoders, and its plot; nothing is stored.
@@ -203,10 +142,8 @@ class Decodes:
             raise NotFound(f"decode {decode_id} has no upload", field="decode_id")
         handler = next(handler for handler in self._handlers if handler.kind == row.kind)
         with self._blobs.opened(row.upload_key) as file:
-            upload = Upload(
-                agency_id, Author(""), file, context_from_document(row.context), row.created_at,
-                wait_s=_WAIT_S, again_id=decode_id,
-            )  # fmt: skip
+            context = context_from_document(row.context)
+            upload = Upload(agency_id, Author(""), file, context, row.created_at, wait_s=_WAIT_S, again_id=decode_id)
             decoded, plot = self._path.decode_again(upload, handler)
         return dict(decoded.document), plot
 
@@ -223,10 +160,10 @@ class Decodes:
     ) -> tuple[list[DecodeHead], str | None]:
         """A page of decodes without their results, newest first, and the id to continue before."""
         with self._database.read() as connection:
+            agency_id, own = caller.agency_id, caller.own_key_id
             rows = store.list_decodes(
-                connection, caller.agency_id, wanted or DecodeFilter(),
-                before=before, limit=limit + 1, holder_id=caller.own_key_id,
-            )  # fmt: skip
+                connection, agency_id, wanted or DecodeFilter(), before=before, limit=limit + 1, holder_id=own
+            )
         page = [decode_head(row) for row in rows[:limit]]
         return page, page[-1]["id"] if len(rows) > limit else None
 
@@ -237,10 +174,6 @@ class Decodes:
             store.get_decode(connection, caller.agency_id, decode_id, holder_id=own)
             jobs.request_cancel(connection, caller.agency_id, decode_id, self._clock())
             return decode_document(store.get_decode(connection, caller.agency_id, decode_id, holder_id=own))
-
-
-def _report(job: RunningJob, done: int, total: int) -> None:
-    job.report_progress(done / total, steps=(done, total))
 
 
 # === A closer look at stored decodes: samples of traces, packets of logs, the vehicle's track, lists of readings.
@@ -254,6 +187,40 @@ _TRACK_WRITERS: Mapping[str, Callable[[DecodeRow], Any]] = {
     "gpx": track_gpx,
 }
 _READING_WRITERS: Mapping[str, Callable[[DecodeRow], Any]] = {"geojson": readings_geojson, "csv": readings_csv}
+
+
+MAX_PACKETS = 20_000
+"""Packets that are listed at most. Source: chosen by hand; 2 MB of JSON."""
+
+
+class VehicleTrackDocument(TypedDict):
+    """The vehicle's own track beside a packet log; the heading is null where it is not known."""
+
+    time_s: list[float]
+    lon_deg: list[float]
+    lat_deg: list[float]
+    heading_deg: list[float | None]
+
+
+class PacketsDocument(TypedDict):
+    """Packets of a log in the order of their times, as columns; null where a value is not known.
+
+    `time_s` are seconds since 1970-01-01 UTC. `verdict` is `accepted` for authentic packets and their repetitions, else
+    the reason why a packet was refused; it is null where the decode does not list it, which has 500 refused packets at
+    most. The position is that of the vehicle.
+    """
+
+    total: int
+    entry: list[int]
+    time_s: list[float | None]
+    number: list[int | None]
+    rssi_dbm: list[float | None]
+    snr_db: list[float | None]
+    verdict: list[str | None]
+    reason: list[str | None]
+    lon_deg: list[float | None]
+    lat_deg: list[float | None]
+    track: VehicleTrackDocument | None
 
 
 class DecodeDetails:
@@ -306,8 +273,8 @@ class DecodeDetails:
         declared = row.context.get("trace") or {}
         name = str(declared.get("file_name") or "recording")
         with self._blobs.opened(_upload_key(row)) as file:
-            task = SamplesTask(name, file, declared, names, from_s, to_s, min(points, MAX_POINTS), self._rules.traces)
-            return self._processes.submit(task).result()
+            most, limits = min(points, MAX_POINTS), self._rules.traces
+            return self._processes.run(read_samples, name, file, declared, names, from_s, to_s, most, limits)
 
     def packets(self, caller: Caller, decode_id: str) -> PacketsDocument:
         """Packets of a log with their strength and verdict, and the vehicle's track.
@@ -321,8 +288,8 @@ class DecodeDetails:
         declared = row.context.get("packets") or {}
         name = str(declared.get("file_name") or "packets")
         with self._blobs.opened(_upload_key(row)) as file:
-            task = DriveTask(name, file, declared, self._rules.packets, self._rules.images)
-            files = self._processes.submit(task).result()
+            rules = self._rules
+            files = self._processes.run(read_drive, name, file, declared, rules.packets, rules.images)
         return _packets(files.packets, files.track, row.result or {})
 
     def track(self, caller: Caller, decode_id: str, form: TrackForm) -> Any:

@@ -6,10 +6,10 @@ import io
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,6 @@ from typing_extensions import TypedDict
 
 from app.formats.frame_list import FrameList, ListedFrame
 from app.formats.logs import LogClock, LogReport, has_zone
-from app.formats.poses import PoseDeclaration, PoseLimits
 from app.formats.text import TableWriter
 from app.geodesy.frames import metres_per_radian
 from app.registry.decodes import DecodeRow
@@ -31,8 +30,7 @@ from app.services.decodes.context import (
     clock_of,
     stamp,
 )
-from app.services.decodes.tasks import frame_terms
-from app.services.ports import Task
+from app.services.decodes.declarations import frame_terms
 from app.tracks.files import gpx_document
 
 # === Positions of the vehicle's own receiver, as a decode keeps them for the track of its drive.
@@ -101,17 +99,6 @@ class FrameLists:
     frames: FrameList | None = None
     track: PoseTrack | None = None
     warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class FrameListTask(Task[FrameLists]):
-    """Files beside the frames to read: name and content of each."""
-
-    is_long: ClassVar[bool] = False
-
-    files: tuple[tuple[str, bytes], ...]
-    declaration: PoseDeclaration
-    limits: PoseLimits = field(default_factory=PoseLimits)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from functools import partial
 
 import sqlalchemy as sa
 
@@ -27,8 +28,10 @@ from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.sensors.camera import Camera
 from app.services.decodes.context import CoarsePosition, DecodeContext, DecodeKind, DecodeRules
+from app.services.decodes.declarations import frame_terms
 from app.services.decodes.frame_documents import DriveNotes, ReadFrame, ReadMarker, frames_result
-from app.services.decodes.frame_poses import FrameListTask, FramePlaces, FramePose, find_gaps
+from app.services.decodes.frame_poses import FramePlaces, FramePose, find_gaps
+from app.services.decodes.frame_tasks import FramePicture, FrameResult, FrameSearch, decode_frame, decode_frames
 from app.services.decodes.matching import (
     FRAME_READERS,
     NearbyMarkers,
@@ -37,8 +40,8 @@ from app.services.decodes.matching import (
     fuse_fixes,
     match_reading,
 )
-from app.services.decodes.tasks import FramePicture, FrameResult, FrameRunTask, FrameSearch, FrameTask, frame_terms
-from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
+from app.services.decodes.upload_path import Decoded, PendingSignal, Upload, UploadHandler, cancelled_on_error
+from app.services.decodes.video_tasks import read_frame_lists
 from app.services.health.frames import frame_health, missed_observations, unregistered_readings
 from app.services.health.record import EVIDENCE
 from app.services.ports import Clock, DecoderProcesses, Pending
@@ -56,38 +59,14 @@ _LARGE = threading.Semaphore(2)
 class FrameSignal:
     """What a decoder process found in a frame, and the markers that it was looking for."""
 
-    result: FrameResult
     nearby: NearbyMarkers
-
-
-@dataclass(slots=True)
-class StartedFrame:
-    """A frame in a decoder process, which loads the picture and then waits for `look_for`."""
-
-    camera: Camera | None
-    pending: Pending[FrameResult]
-    search: Future[FrameSearch]
-    nearby: NearbyMarkers | None = None
-
-    def look_for(self, nearby: NearbyMarkers) -> None:
-        """Let the process go on: the markers that the registry has near by are known."""
-        self.nearby = nearby
-        self.search.set_result(search_for(nearby, self.camera))
-
-    def result(self) -> FrameSignal:
-        """Wait for the readings."""
-        assert self.nearby is not None
-        return FrameSignal(self.pending.result(), self.nearby)
-
-    def cancel(self) -> None:
-        """Stop the process."""
-        self.pending.cancel()
+    result: FrameResult
 
 
 def search_for(nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:
     """What to look for in a frame of this camera."""
     searches = {name: reader.search(nearby.of(name), camera) for name, reader in FRAME_READERS.items()}
-    return FrameSearch({name: search for name, search in searches.items() if search is not None})
+    return {name: search for name, search in searches.items() if search is not None}
 
 
 class FrameHandler(UploadHandler[FrameSignal]):
@@ -109,49 +88,40 @@ class FrameHandler(UploadHandler[FrameSignal]):
             raise unknown_picture(head, list_decoded(), _DECLARE)
         return False
 
-    def start(self, upload: Upload) -> StartedFrame:
-        """Hand the frame over, and look up the markers near by while the process loads the picture."""
-        started = start_frame(self._processes, upload.file, upload.context, self._rules.images, wait_s=upload.wait_s)
-        try:
+    def start(self, upload: Upload) -> Pending[FrameSignal]:
+        """Hand the frame over, and look up the markers near by while the process loads the picture.
+
+        Raises
+        ------
+        UnreadableUpload, InvalidParameter
+            The frame is refused, or it is not this camera's.
+        Unavailable
+            The decoder processes are busy.
+        """
+        context, limits = upload.context, self._rules.images
+        header = inspect_frame(upload.file, context, limits)
+        camera = context.camera.camera_for(header) if context.camera else None
+        picture = FramePicture(upload.file, context.thermal, context.thermal_range, limits)
+        search: Future[FrameSearch] = Future()
+        pending = self._processes.submit(decode_frame, picture, search, wait_s=upload.wait_s)
+        with cancelled_on_error(pending):
             with self._database.read() as connection:
-                nearby = find_nearby_markers(connection, upload.agency_id, upload.context.coarse_position)
-            started.look_for(nearby)
-        except BaseException:
-            started.cancel()
-            raise
-        return started
+                nearby = find_nearby_markers(connection, upload.agency_id, context.coarse_position)
+            search.set_result(search_for(nearby, camera))
+        return PendingSignal(pending, partial(FrameSignal, nearby))
 
     def match(self, connection: sa.Connection, upload: Upload, signal: FrameSignal) -> Decoded:
         """Match the frame's readings."""
         context = upload.context
-        at = context.captured_at or FramePlaces(context).time_of(0, taken=signal.result.header.taken)
-        pose = FramePlaces(context).pose_of(None)
-        frame = read_frame(
-            connection, upload, Member(0, ""), signal.result, signal.nearby, FrameMoment(context, at, pose)
-        )
+        places = FramePlaces(context)
+        at = context.captured_at or places.time_of(0, taken=signal.result.header.taken)
+        moment = FrameMoment(context, at, places.pose_of(None))
+        frame = read_frame(connection, upload, Member(0, ""), signal.result, signal.nearby, moment)
         return decoded_frames([frame], len(signal.nearby.codebook), upload.observed_at)
 
 
-def start_frame(
-    processes: DecoderProcesses, file: SpooledFile, context: DecodeContext, limits: ImageLimits, *, wait_s: float = 0.0
-) -> StartedFrame:
-    """Hand a frame to a decoder process, after checking its header against the limits and the camera.
-
-    Raises
-    ------
-    UnreadableUpload, InvalidParameter
-        The frame is refused, or it is not this camera's.
-    Unavailable
-        The decoder processes are busy.
-    """
-    header = inspect_frame(file, context, limits)
-    camera = context.camera.camera_for(header) if context.camera else None
-    task = FrameTask(FramePicture(file, context.thermal, context.thermal_range, limits))
-    return StartedFrame(camera, processes.submit(task, wait_s=wait_s), task.search)
-
-
 def inspect_frame(file: SpooledFile, context: DecodeContext, limits: ImageLimits) -> ImageHeader:
-    """Header of a frame, checked against the limits; raises as `start_frame`."""
+    """Header of a frame, checked against the limits; raises as `FrameHandler.start`."""
     if file.size > limits.file_bytes:
         raise UploadTooLarge(
             f"a picture of {file.size} bytes",
@@ -277,7 +247,7 @@ class ArchiveFrame:
     name: str
     moment: FrameMoment
     picture: FramePicture | None = None  # None where an error keeps it from the decoder processes
-    search: FrameSearch = field(default_factory=lambda: FrameSearch({}))
+    search: FrameSearch = field(default_factory=dict)
     nearby: NearbyMarkers = field(default_factory=NearbyMarkers)
     pixels: int = 0  # [px]
     error: WaymarkError | None = None
@@ -298,7 +268,7 @@ def in_runs(frames: Iterable[ArchiveFrame]) -> Iterator[list[ArchiveFrame]]:
         yield run
 
 
-class StartedRun:
+class PendingRun:
     """Frames in a decoder process.
 
     Parameters
@@ -337,8 +307,8 @@ class StartedRun:
             self._pending.cancel()
 
     def _submit(self, frames: list[ArchiveFrame]) -> Pending[tuple[FrameResult | WaymarkError, ...]] | None:
-        tasks = tuple((frame.picture, frame.search) for frame in frames if frame.picture is not None)
-        return self._processes.submit(FrameRunTask(tasks), wait_s=self._wait_s) if tasks else None
+        run = tuple((frame.picture, frame.search) for frame in frames if frame.picture is not None)
+        return self._processes.submit(decode_frames, run, wait_s=self._wait_s) if run else None
 
     def _alone(self, frame: ArchiveFrame, report: Callable[[], None]) -> FrameResult | WaymarkError:
         report()
@@ -390,9 +360,9 @@ class ArchiveHandler(UploadHandler[ArchiveSignal]):
             _check_holds_frames(file)
         return True
 
-    def start(self, upload: Upload) -> StartedArchive:
+    def start(self, upload: Upload) -> PendingArchive:
         """Frames are handed over as the decoder processes become free."""
-        return StartedArchive(upload, self._database, self._clock, self._processes, self._rules)
+        return PendingArchive(upload, self._database, self._clock, self._processes, self._rules)
 
     def match(self, connection: sa.Connection, upload: Upload, signal: ArchiveSignal) -> Decoded:
         """Collect the frames, which were matched as they came."""
@@ -411,7 +381,7 @@ def _check_holds_frames(file: SpooledFile) -> None:
         )
 
 
-class StartedArchive:
+class PendingArchive:
     """An archive whose frames go through the decoder processes in runs, more than one at the same time."""
 
     def __init__(
@@ -420,7 +390,7 @@ class StartedArchive:
         self._upload = upload
         self._database, self._clock = database, clock
         self._processes, self._rules = processes, rules
-        self._waiting: deque[StartedRun] = deque()
+        self._waiting: deque[PendingRun] = deque()
         self._frames: list[ReadFrame] = []
         self._reported_at = self._part_at = clock()
         self._nearby: tuple[CoarsePosition | None, NearbyMarkers] | None = None
@@ -435,21 +405,18 @@ class StartedArchive:
         file, limits = self._upload.file, self._rules.archives
         total = count_members(file, limits)
         self._read_lists(file)
-        frames = self._frames
-        frames.clear()
-        self._with_plates.clear()
-        self._upload.report_progress(0, total)
+        self._upload.report(0, total)
         self._reported_at = self._part_at = self._clock()
         for run in in_runs(self._prepare(m) for m in read_members(file, limits) if not is_beside_frames(m.name)):
-            self._waiting.append(StartedRun(self._processes, run, self._upload.wait_s))
-            if len(self._waiting) > self._rules.frames_in_flight:  # one waits, so that no process does
+            self._waiting.append(PendingRun(self._processes, run, self._upload.wait_s))
+            if len(self._waiting) > self._rules.frames_in_flight:  # one run waits, so that no process does
                 self._finish(self._waiting.popleft(), total)
         while self._waiting:
             self._finish(self._waiting.popleft(), total)
         self._confirm()
-        gaps, warnings = find_gaps([(frame.index, frame.captured_at) for frame in frames])
+        gaps, warnings = find_gaps([(frame.index, frame.captured_at) for frame in self._frames])
         notes = DriveNotes((*self._places.warnings, *warnings), gaps, receiver=self._places.receiver)
-        return ArchiveSignal(frames, len(self._codebook), notes)
+        return ArchiveSignal(self._frames, len(self._codebook), notes)
 
     def _report(self, total: int) -> None:
         """Record now and then how far the job is; what this raises stops it."""
@@ -457,13 +424,12 @@ class StartedArchive:
         if now - self._reported_at < self._rules.progress_every:
             return
         self._reported_at = now
-        if now - self._part_at < PART_EVERY:
-            self._upload.report_progress(done, total)
-            return
-        self._part_at = now
-        notes = DriveNotes(self._places.warnings)
-        part = frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes)
-        self._upload.report_part(done, total, part)
+        part = None
+        if now - self._part_at >= PART_EVERY:
+            self._part_at = now
+            notes = DriveNotes(self._places.warnings)
+            part = frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes)
+        self._upload.report(done, total, part)
 
     def cancel(self) -> None:
         """Stop the frames that are on their way."""
@@ -479,8 +445,8 @@ class StartedArchive:
             files = tuple(
                 (m.name, m.data) for m in read_members(file, limits, only=is_beside_frames) if m.error is None
             )
-            task = FrameListTask(files, frame_terms(context.frames or {}).poses)
-            lists = self._processes.submit(task, wait_s=self._upload.wait_s).result()
+            poses = frame_terms(context.frames or {}).poses
+            lists = self._processes.run(read_frame_lists, files, poses, wait_s=self._upload.wait_s)
             self._places = FramePlaces(context, lists)
         self._places.check_names([name for name in names if not is_beside_frames(name)])
 
@@ -522,7 +488,7 @@ class StartedArchive:
             self._codebook.update(self._nearby[1].codebook)
         return self._nearby[1]
 
-    def _finish(self, run: StartedRun, total: int) -> None:
+    def _finish(self, run: PendingRun, total: int) -> None:
         """Wait for a run, and match its frames."""
         results = run.results(lambda: self._report(total))
         with self._database.read() as connection:

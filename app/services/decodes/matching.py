@@ -55,7 +55,8 @@ from app.registry.markers import MarkerFilter, SpanRow
 from app.sensors.camera import Camera
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.decodes.context import CoarsePosition
-from app.services.decodes.tasks import DriveFiles, PacketTerms
+from app.services.decodes.declarations import PacketTerms
+from app.services.decodes.packet_tasks import DriveFiles
 
 MAX_CODEBOOK = 500
 FRAME_READERS: Mapping[str, FrameReader[FrameReading, object]] = {

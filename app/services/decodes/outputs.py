@@ -18,10 +18,13 @@ from app.registry.database import Database
 from app.registry.decodes import DecodeRow
 from app.services.access.access import Caller
 from app.services.decodes.context import DecodeKind, DecodeRules, DecodeTimes, clock_of, context_from_document, stamp
+from app.services.decodes.declarations import frame_terms
 from app.services.decodes.frame_poses import TrackGeometry
+from app.services.decodes.frame_tasks import FramePicture, annotate_frame
 from app.services.decodes.lane_documents import LaneCollection, lane_geojson, overlay_from_document
-from app.services.decodes.tasks import AnnotationTask, OverlayTask, VideoFrameTask, frame_terms
+from app.services.decodes.packet_tasks import draw_overlay
 from app.services.decodes.video_handler import video_of
+from app.services.decodes.video_tasks import draw_video_frame
 from app.services.ports import Blobs, DecoderProcesses
 
 # === Readings of a decode as one list in the order of their times, whatever was uploaded; as CSV and GeoJSON.
@@ -216,14 +219,12 @@ class DecodeOutputs:
             if row.kind == DecodeKind.VIDEO:
                 video = video_of(context, file, self._rules.archives)
                 rate_hz = frame_terms(context.frames or {}).rate_hz
-                video_task = VideoFrameTask(video, frame, outlines, suffix, self._rules.videos, rate_hz)
-                return self._processes.submit(video_task).result()
+                limits = self._rules.videos
+                return self._processes.run(draw_video_frame, video, frame, outlines, suffix, limits, rate_hz)
             if row.kind == DecodeKind.ARCHIVE:
                 file = SpooledFile.of(read_member(file, frame, self._rules.archives).data)
-            task = AnnotationTask(
-                file, outlines, suffix, context.thermal, context.thermal_range, limits=self._rules.images
-            )
-            return self._processes.submit(task).result()
+            picture = FramePicture(file, context.thermal, context.thermal_range, self._rules.images)
+            return self._processes.run(annotate_frame, picture, outlines, suffix)
 
     def overlay(self, caller: Caller, decode_id: str, suffix: str) -> bytes:
         """The camera frame of a drive with its lane drawn over it, encoded as ``png`` or ``jpg``.
@@ -244,8 +245,7 @@ class DecodeOutputs:
             )
         shown = overlay_from_document(overlay)
         with self._upload(row) as file:
-            task = OverlayTask(file, overlay["frame"], shown, suffix, self._rules.images)
-            return self._processes.submit(task).result()
+            return self._processes.run(draw_overlay, file, overlay["frame"], shown, suffix, self._rules.images)
 
     def lane(self, caller: Caller, decode_id: str) -> LaneCollection:
         """Path, boundaries and markers of a drive as GeoJSON.

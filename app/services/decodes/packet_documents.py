@@ -29,7 +29,7 @@ from app.services.decodes.lane_documents import (
     steering_document,
 )
 from app.services.decodes.matching import ReadPackets
-from app.services.decodes.tasks import DriveFiles, LaneResult
+from app.services.decodes.packet_tasks import DriveFiles, LaneResult
 
 DECODER_VERSION = "cerpm/3"
 MAX_REFUSED = 500

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,14 @@ from app.errors import TooManyRequests, UnreadableUpload
 from app.formats.format import SpooledFile
 from app.geodesy import decimal_year
 from app.markers.cerpm import MAX_INVALID_TAGS_PER_DAY, MAX_INVALID_TAGS_PER_LOG
+from app.plots.lane import SignalPicture
 from app.registry import markers
 from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.registry.markers import CODEBOOKS, book_of
-from app.sensors.camera import Camera
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.decodes.context import DecodeContext, DecodeKind, DecodeRules
+from app.services.decodes.declarations import packet_terms, trace_terms
 from app.services.decodes.matching import (
     NearbyTags,
     ReadPackets,
@@ -34,19 +36,17 @@ from app.services.decodes.matching import (
     spans_of,
 )
 from app.services.decodes.packet_documents import claimed_place, packet_observations, packets_document
-from app.services.decodes.tasks import (
+from app.services.decodes.packet_tasks import (
     DriveFiles,
-    DriveTask,
     LaneResult,
-    LaneTask,
-    PacketTerms,
-    TraceResult,
-    TraceTask,
-    packet_terms,
-    trace_terms,
+    LeftOutMarker,
+    PosedCamera,
+    estimate_lane,
+    read_drive,
 )
 from app.services.decodes.trace_documents import trace_document
-from app.services.decodes.upload_path import Decoded, OutdatedMatch, Upload, UploadHandler
+from app.services.decodes.trace_tasks import TraceResult, decode_recording
+from app.services.decodes.upload_path import Decoded, OutdatedMatch, PendingSignal, Upload, UploadHandler
 from app.services.health.record import EVIDENCE
 from app.services.health.traces import (
     lane_directions,
@@ -120,24 +120,8 @@ def forgery_detail(verification: Verification) -> dict[str, int] | None:
 class TraceSignal:
     """What a decoder process found in a recording, and the tags that it was looking for."""
 
+    nearby: NearbyTags
     result: TraceResult
-    nearby: NearbyTags
-
-
-@dataclass(frozen=True, slots=True)
-class StartedTrace:
-    """A recording in a decoder process."""
-
-    nearby: NearbyTags
-    pending: Pending[TraceResult]
-
-    def result(self) -> TraceSignal:
-        """Wait for the findings."""
-        return TraceSignal(self.pending.result(), self.nearby)
-
-    def cancel(self) -> None:
-        """Stop the process."""
-        self.pending.cancel()
 
 
 class TraceHandler(UploadHandler[TraceSignal]):
@@ -157,7 +141,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
         check_not_empty(file)
         return file.size > self._rules.immediate_trace_bytes
 
-    def start(self, upload: Upload) -> StartedTrace:
+    def start(self, upload: Upload) -> Pending[TraceSignal]:
         """Hand the recording over with the tags that the drive can have passed."""
         declared = upload.context.trace or {}
         position, reach_m = upload.context.coarse_position, trace_terms(declared).reach_m
@@ -166,8 +150,17 @@ class TraceHandler(UploadHandler[TraceSignal]):
             nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m, epoch)
             formats = () if nearby.texts else _book_formats(connection, upload.agency_id)
         name = str(declared.get("file_name") or "recording")
-        task = TraceTask(name, upload.file, declared, nearby.texts, formats, self._rules.traces)
-        return StartedTrace(nearby, self._processes.submit(task, wait_s=upload.wait_s))
+        pending = self._processes.submit(
+            decode_recording,
+            name,
+            upload.file,
+            declared,
+            nearby.texts,
+            formats,
+            self._rules.traces,
+            wait_s=upload.wait_s,
+        )
+        return PendingSignal(pending, partial(TraceSignal, nearby))
 
     def plot(self, signal: TraceSignal) -> bytes:
         """The trace with what was found in it."""
@@ -227,10 +220,6 @@ def _what(wrong_way: bool, evidence: dict[str, Any]) -> str:
 # === Packet logs of CERPMs: verified against the registry, and a lane estimated through their markers.
 
 
-Pose = tuple[float, float, float]
-"""Longitude, latitude and heading of a vehicle. [deg]"""
-
-
 @dataclass(frozen=True, slots=True)
 class DriveSignal:
     """A drive past CERPMs: its packets, verified against the registry, and the lane through their markers."""
@@ -261,15 +250,42 @@ class PacketHandler(UploadHandler[DriveSignal]):
         check_not_empty(file)
         return file.size > self._rules.immediate_trace_bytes
 
-    def start(self, upload: Upload) -> StartedDrive:
+    def start(self, upload: Upload) -> Pending[DriveSignal]:
         """Have the files of the drive read."""
         if upload.again_id is None:
             self._invalid_tags.left(_holder(upload), upload.received_at)
         declared = upload.context.packets or {}
         name = str(declared.get("file_name") or "packets")
-        task = DriveTask(name, upload.file, declared, self._rules.packets, self._rules.images)
-        files = self._processes.submit(task, wait_s=upload.wait_s)
-        return StartedDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
+        packets, images = self._rules.packets, self._rules.images
+        files = self._processes.submit(read_drive, name, upload.file, declared, packets, images, wait_s=upload.wait_s)
+        return PendingSignal(files, partial(self._verify, upload))
+
+    def _verify(self, upload: Upload, files: DriveFiles) -> DriveSignal:
+        """Verify the packets against the registry as it is now, and estimate the lane."""
+        terms = packet_terms(upload.context.packets or {})
+        with self._database.read() as connection:
+            numbers = list_numbers(files.packets)
+            known = find_known(connection, upload.agency_id, self._secrets, numbers, upload.again_id)
+        max_invalid_tags = self._invalid_tags.left(_holder(upload), upload.received_at)
+        read = read_packets_of(
+            files,
+            known,
+            terms,
+            max_invalid_tags,
+            received_at=upload.received_at,
+            observed_at=upload.observed_at,
+        )
+        lane = self._processes.run(
+            estimate_lane,
+            lane_markers(read.merged),
+            _left_out(read),
+            files.track,
+            terms,
+            _signals(read),
+            _posed_camera(files, upload.context),
+            wait_s=upload.wait_s,
+        )
+        return DriveSignal(files, read, lane)
 
     def plot(self, signal: DriveSignal) -> bytes:
         """The lane and the radio signals."""
@@ -315,67 +331,26 @@ class PacketHandler(UploadHandler[DriveSignal]):
         return [*with_evidence(rows, evidence, directions), *missed]
 
 
-@dataclass(frozen=True, slots=True)
-class StartedDrive:
-    """The files of a drive in a decoder process."""
-
-    upload: Upload
-    files: Pending[DriveFiles]
-    database: Database
-    processes: DecoderProcesses
-    secrets: AgencySecrets
-    invalid_tags: InvalidTagLimit
-
-    def result(self) -> DriveSignal:
-        """Verify the packets against the registry as it is now, and estimate the lane."""
-        upload, files = self.upload, self.files.result()
-        terms = packet_terms(upload.context.packets or {})
-        camera, pose = _view(files, upload.context)
-        with self.database.read() as connection:
-            known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets), upload.again_id)
-        max_invalid_tags = self.invalid_tags.left(_holder(upload), upload.received_at)
-        read = read_packets_of(
-            files,
-            known,
-            terms,
-            max_invalid_tags,
-            received_at=upload.received_at,
-            observed_at=upload.observed_at,
-        )
-        task = _lane_task(files, read, terms, camera, pose)
-        return DriveSignal(files, read, self.processes.submit(task, wait_s=upload.wait_s).result())
-
-    def cancel(self) -> None:
-        """Stop the process."""
-        self.files.cancel()
-
-
 def _holder(upload: Upload) -> str:
     return upload.author.key_id or upload.agency_id
 
 
-def _lane_task(
-    files: DriveFiles, read: ReadPackets, terms: PacketTerms, camera: Camera | None, pose: Pose | None
-) -> LaneTask:
+def _signals(read: ReadPackets) -> SignalPicture | None:
+    """Strengths of the accepted packets over the distance, and the path loss that was fitted to them."""
     profiles = [profile for profile in read.signal.profiles.values() if len(profile.distance_m)]
-    none = np.empty(0)
-    distance_m = np.concatenate([profile.distance_m for profile in profiles] or [none])
-    rssi_dbm = np.concatenate([profile.rssi_dbm for profile in profiles] or [none])
-    measured = np.isfinite(distance_m) & np.isfinite(rssi_dbm)
+    if not profiles:
+        return None
+    distance_m = np.concatenate([profile.distance_m for profile in profiles])
+    rssi_dbm = np.concatenate([profile.rssi_dbm for profile in profiles])
+    known = np.isfinite(distance_m) & np.isfinite(rssi_dbm)
+    if not known.any():
+        return None
     loss = read.signal.path_loss
-    return LaneTask(
-        lane_markers(read.merged),
-        _left_out(read),
-        files.track,
-        terms,
-        (distance_m[measured], rssi_dbm[measured]),
-        None if loss is None else (loss.at_1m_dbm, loss.exponent.value),
-        camera,
-        pose,
-    )
+    fitted = (None, None) if loss is None else (loss.at_1m_dbm, loss.exponent.value)
+    return SignalPicture(distance_m[known], rssi_dbm[known], *fitted)
 
 
-def _left_out(read: ReadPackets) -> tuple[tuple[int, float, float, str], ...]:
+def _left_out(read: ReadPackets) -> tuple[LeftOutMarker, ...]:
     found = []
     for number, reason in read.merged.left_out.items():
         lon_deg, lat_deg = claimed_place(number, read)
@@ -384,10 +359,10 @@ def _left_out(read: ReadPackets) -> tuple[tuple[int, float, float, str], ...]:
     return tuple(found)
 
 
-def _view(files: DriveFiles, context: DecodeContext) -> tuple[Camera | None, Pose | None]:
-    """Camera of the frame, and where the vehicle was and pointed when it was taken."""
+def _posed_camera(files: DriveFiles, context: DecodeContext) -> PosedCamera | None:
+    """Camera of the frame, and where the vehicle was and pointed when it was taken; None where either is unknown."""
     if files.frame is None or context.camera is None:
-        return None, None
+        return None
     camera = context.camera.camera_for(files.frame[1])
     track = files.track
     if track is not None and context.captured_at is not None:
@@ -397,8 +372,8 @@ def _view(files: DriveFiles, context: DecodeContext) -> tuple[Camera | None, Pos
         if np.isfinite(lon_deg) and headings.any():
             turned = np.unwrap(track.heading_deg[headings], period=360.0)
             heading_deg = float(np.interp(at_s, track.time_s[headings], turned)) % 360.0
-            return camera, (float(lon_deg), float(lat_deg), heading_deg)
+            return PosedCamera(camera, (float(lon_deg), float(lat_deg), heading_deg))
     coarse = context.coarse_position
     if coarse is not None and context.heading_deg is not None:
-        return camera, (coarse.lon_deg, coarse.lat_deg, context.heading_deg)
-    return camera, None
+        return PosedCamera(camera, (coarse.lon_deg, coarse.lat_deg, context.heading_deg))
+    return None

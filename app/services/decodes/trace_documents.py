@@ -13,7 +13,7 @@ from app.decoders.magnet.identify import ReadTag, ReadTrace, TagFix, TagMatch
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding, TagReading
 from app.formats.traces.declaration import LeftOut, TraceGap
 from app.services.decodes.context import count_of
-from app.services.decodes.tasks import TraceMotion, TraceResult
+from app.services.decodes.trace_tasks import TraceMotion, TraceResult
 
 MAX_NOISE = 500
 

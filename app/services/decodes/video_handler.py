@@ -26,6 +26,7 @@ from app.formats.video_file import (
 from app.registry.database import Database
 from app.registry.spatial import distance_m
 from app.services.decodes.context import MAX_ACCURACY_M, CoarsePosition, DecodeContext, DecodeKind, DecodeRules
+from app.services.decodes.declarations import frame_terms
 from app.services.decodes.frame_documents import (
     DriveNotes,
     ReadFrame,
@@ -35,16 +36,16 @@ from app.services.decodes.frame_documents import (
 )
 from app.services.decodes.frame_poses import (
     FrameLists,
-    FrameListTask,
     FramePlaces,
     FramePose,
     GapDocument,
     ReceiverPositions,
 )
-from app.services.decodes.frames import FrameMoment, decoded_frames, read_frame
-from app.services.decodes.matching import FRAME_READERS, NearbyMarkers, find_nearby_markers
-from app.services.decodes.tasks import FrameResult, IndexVideoTask, SegmentResult, SegmentTask, frame_terms
+from app.services.decodes.frame_tasks import FrameResult
+from app.services.decodes.frames import FrameMoment, decoded_frames, read_frame, search_for
+from app.services.decodes.matching import NearbyMarkers, find_nearby_markers
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
+from app.services.decodes.video_tasks import SegmentResult, decode_segment, index_frames, read_frame_lists
 from app.services.ports import Clock, DecoderProcesses, Pending
 
 if TYPE_CHECKING:  # it loads numba
@@ -95,9 +96,9 @@ class VideoHandler(UploadHandler[VideoSignal]):
         """Always."""
         return True
 
-    def start(self, upload: Upload) -> StartedVideo:
+    def start(self, upload: Upload) -> PendingVideo:
         """Segments are handed over as the decoder processes become free."""
-        return StartedVideo(upload, self._database, self._clock, self._processes, self._rules)
+        return PendingVideo(upload, self._database, self._clock, self._processes, self._rules)
 
     def match(self, connection: sa.Connection, upload: Upload, signal: VideoSignal) -> Decoded:
         """Collect the frames, which were matched as they came."""
@@ -105,13 +106,13 @@ class VideoHandler(UploadHandler[VideoSignal]):
 
 
 @dataclass(frozen=True, slots=True)
-class _OnItsWay:
+class _PendingSegment:
     segment: VideoSegment
     pending: Pending[SegmentResult]
     nearby: NearbyMarkers
 
 
-class StartedVideo:
+class PendingVideo:
     """A video whose segments go through the decoder processes, some at the same time."""
 
     def __init__(
@@ -120,7 +121,7 @@ class StartedVideo:
         self._upload = upload
         self._database, self._clock = database, clock
         self._processes, self._rules = processes, rules
-        self._waiting: deque[_OnItsWay] = deque()
+        self._waiting: deque[_PendingSegment] = deque()
         self._signal = VideoSignal()
         self._places = FramePlaces(upload.context)
         self._began_at: datetime | None = None
@@ -129,25 +130,21 @@ class StartedVideo:
 
     def result(self) -> VideoSignal:
         """Decode all segments."""
-        self._signal, self._last = VideoSignal(), []
         index = self._index()
-        done = 0
-        self._upload.report_progress(0, len(index.stamps))
+        total = len(index.stamps)
+        self._upload.report(0, total)
         for number, segment in enumerate(index.segments):
             self._waiting.append(self._start(index, number, segment))
             if len(self._waiting) >= self._rules.frames_in_flight:
-                done = self._finish(index, self._waiting.popleft())
-                self._report(done, len(index.stamps))
+                self._finish(index, self._waiting.popleft())
         while self._waiting:
-            done = self._finish(index, self._waiting.popleft())
-            self._report(done, len(index.stamps))
-        for count, what in ((self._signal.damaged, _DAMAGED), (self._signal.other_size, _OTHER_SIZE)):
+            self._finish(index, self._waiting.popleft())
+        signal = self._signal
+        for count, what in ((signal.damaged, _DAMAGED), (signal.other_size, _OTHER_SIZE)):
             if count:
-                self._signal.warnings.append(
-                    f"{count} of {len(index.stamps)} frames {what}; {self._signal.searched} were searched"
-                )
-        self._signal.warnings += [text for text in self._places.warnings if text not in self._signal.warnings]
-        return self._signal
+                signal.warnings.append(f"{count} of {total} frames {what}; {signal.searched} were searched")
+        signal.warnings += [text for text in self._places.warnings if text not in signal.warnings]
+        return signal
 
     def cancel(self) -> None:
         """Stop the segments that are on their way."""
@@ -164,17 +161,21 @@ class StartedVideo:
             packed = open_packed_video(upload.file, self._rules.archives)
             video = packed.video
             if packed.beside:
-                task = FrameListTask(packed.beside, terms.poses)
-                self._places = FramePlaces(context, self._processes.submit(task, wait_s=wait_s).result())
+                lists = self._processes.run(read_frame_lists, packed.beside, terms.poses, wait_s=wait_s)
+                self._places = FramePlaces(context, lists)
         else:
             video = VideoFile(upload.file, kind)
-        index = self._processes.submit(IndexVideoTask(video, self._rules.videos, terms.rate_hz), wait_s=wait_s).result()
+        index = self._processes.run(index_frames, video, self._rules.videos, terms.rate_hz, wait_s=wait_s)
         self._signal.warnings += index.warnings
         self._signal.gaps += [
-            {"after_frame": gap.after_frame, "before_frame": gap.before_frame, "seconds": gap.seconds,
-             "reason": gap.reason}
+            {
+                "after_frame": gap.after_frame,
+                "before_frame": gap.before_frame,
+                "seconds": gap.seconds,
+                "reason": gap.reason,
+            }
             for gap in index.gaps
-        ]  # fmt: skip
+        ]
         if index.track is not None:
             self._places = FramePlaces(context, FrameLists(track=index.track))
         self._signal.receiver = self._places.receiver
@@ -189,7 +190,7 @@ class StartedVideo:
 
     # --- segments -----------------------------------------------------------------------------------------------------
 
-    def _start(self, index: VideoIndex, number: int, segment: VideoSegment) -> _OnItsWay:
+    def _start(self, index: VideoIndex, number: int, segment: VideoSegment) -> _PendingSegment:
         poses = list(self._poses(index, segment))
         with self._database.read() as connection:
             nearby = find_nearby_markers(connection, self._upload.agency_id, _around(pose for _at, pose in poses))
@@ -199,13 +200,16 @@ class StartedVideo:
         if setup is not None:
             size = setup.width_px or index.width_px, setup.height_px or index.height_px
             camera = setup.camera_for(_header(*size))
-        wanted = {name: reader.search(nearby.of(name), camera) for name, reader in FRAME_READERS.items()}
-        task = SegmentTask(
-            index, number, {name: search for name, search in wanted.items() if search is not None},
+        pending = self._processes.submit(
+            decode_segment,
+            index,
+            number,
+            search_for(nearby, camera),
             self._upload.context.thermal,
             tuple((at, pose.speed_m_s) for at, pose in poses if pose.speed_m_s is not None),
-        )  # fmt: skip
-        return _OnItsWay(segment, self._processes.submit(task, wait_s=self._upload.wait_s), nearby)
+            wait_s=self._upload.wait_s,
+        )
+        return _PendingSegment(segment, pending, nearby)
 
     def _poses(self, index: VideoIndex, segment: VideoSegment) -> Iterator[tuple[float, FramePose]]:
         first_s, last_s = float(index.time_s[segment.first]), float(index.time_s[segment.end - 1])
@@ -217,8 +221,8 @@ class StartedVideo:
     def _at(self, time_s: float) -> datetime | None:
         return None if self._began_at is None else self._began_at + timedelta(seconds=time_s)
 
-    def _finish(self, index: VideoIndex, waiting: _OnItsWay) -> int:
-        """Match what a segment shows; returns the number of the frame after it."""
+    def _finish(self, index: VideoIndex, waiting: _PendingSegment) -> None:
+        """Wait for a segment, and match what it shows."""
         result, signal = waiting.pending.result(), self._signal
         signal.searched += result.frames
         signal.damaged += result.damaged
@@ -226,9 +230,13 @@ class StartedVideo:
         for count, what in ((result.damaged, _DAMAGED), (result.other_size, _OTHER_SIZE)):
             if count:
                 signal.gaps.append(
-                    {"after_frame": waiting.segment.first, "before_frame": waiting.segment.end, "seconds": None,
-                     "reason": f"{count} frames {what}"}
-                )  # fmt: skip
+                    {
+                        "after_frame": waiting.segment.first,
+                        "before_frame": waiting.segment.end,
+                        "seconds": None,
+                        "reason": f"{count} frames {what}",
+                    }
+                )
         plates = [plate for plate in result.plates if not _was_followed(plate, self._last)]
         self._last = [plate for plate in result.plates if plate.seen[-1].frame >= waiting.segment.end - 1]
         by_frame = _by_frame(plates, result.others)
@@ -242,14 +250,12 @@ class StartedVideo:
                 moment = self._moment(time_s)
                 nearby = _within_reach(waiting.nearby, moment.context.coarse_position)
                 found = FrameResult(header, readings, 0.0, result.decode_ms / max(result.frames, 1))
-                member = Member(number, "")
-                frame = read_frame(
-                    connection, self._upload, member, found, nearby, moment, speed_m_s=speed_m_s
-                )  # fmt: skip
+                member, upload = Member(number, ""), self._upload
+                frame = read_frame(connection, upload, member, found, nearby, moment, speed_m_s=speed_m_s)
                 frames[number] = replace(frame, time_s=time_s)
         signal.frames += frames.values()
         signal.plates += [seen_plate_document(plate, frames) for plate in plates if len(plate.seen) > 1 or plate.alone]
-        return waiting.segment.end
+        self._report(waiting.segment.end, len(index.stamps))
 
     def _moment(self, time_s: float) -> FrameMoment:
         at = self._at(time_s)
@@ -257,14 +263,11 @@ class StartedVideo:
         return FrameMoment(self._places.context_at(pose), at, pose)
 
     def _report(self, done: int, total: int) -> None:
-        now = self._clock()
-        if now - self._part_at < PART_EVERY:
-            self._upload.report_progress(done, total)
-            return
-        self._part_at = now
-        signal = self._signal
-        part = frames_result(signal.frames, codebook_plates=len(signal.codebook), notes=signal.notes)
-        self._upload.report_part(done, total, part)
+        now, signal, part = self._clock(), self._signal, None
+        if now - self._part_at >= PART_EVERY:
+            self._part_at = now
+            part = frames_result(signal.frames, codebook_plates=len(signal.codebook), notes=signal.notes)
+        self._upload.report(done, total, part)
 
 
 def _kind_of(context: DecodeContext, file: SpooledFile) -> VideoKind | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Annotated, NotRequired, cast
 
@@ -12,8 +11,7 @@ from typing_extensions import TypedDict
 from app.registry.jobs import JobRow, JobState
 from app.services.documents import ErrorDocument, document_of
 from app.services.drives.collect import LeftOutMarker
-from app.services.ports import Task
-from app.tracks.types import ClockOffset, FixResult, Track, TrackInput, TrackRules
+from app.tracks.types import ClockOffset, FixResult, Track
 
 TRACK_FILES = {
     "track.geojson": "application/geo+json",
@@ -311,26 +309,3 @@ def _other_marker(entry: LeftOutMarker, *, used: bool) -> DriveMarker:
 def time_text(seconds: float) -> str:
     """A time in UTC, to the millisecond, RFC 3339."""
     return datetime.fromtimestamp(round(seconds, 3), UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-# === The task of a decoder process that estimates a drive's track, and its result.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackTask(Task["WrittenTrack"]):
-    """What is known of a drive."""
-
-    name: str
-    given: TrackInput
-    rules: TrackRules
-    left_out: tuple[LeftOutMarker, ...] = ()  # before the track was estimated
-    on_lane: tuple[LeftOutMarker, ...] = ()  # CERPMs whose path was used
-    warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WrittenTrack:
-    """A track as files: content by name, compressed with zlib; and what is stored with the drive."""
-
-    report: DriveReport
-    files: dict[str, bytes] = field(default_factory=dict)

@@ -21,7 +21,8 @@ from app.services.access.access import Caller
 from app.services.blobs import delete_unused, staged
 from app.services.decodes.matching import horizontal_rmse_m
 from app.services.drives.collect import Collected, DecodeClock, collect
-from app.services.drives.documents import DrivePage, TrackedDriveDocument, TrackTask, drive_document, drive_head
+from app.services.drives.documents import DrivePage, TrackedDriveDocument, drive_document, drive_head
+from app.services.drives.tasks import write_track
 from app.services.fleet.vehicles import find_vehicle
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
@@ -118,11 +119,16 @@ class Drives:
             found = collect(_decodes(connection, agency_id, clocks, None), use_unfit=use_unfit)
             survey = _survey_m2(connection, agency_id, found)
         job.report_progress(_COLLECTED)
-        task = TrackTask(
-            given["name"] or f"drive {job.row.id}", found.given(survey), TrackRules(**options),
-            tuple(found.left_out), tuple(found.on_lane), tuple(found.warnings),
-        )  # fmt: skip
-        written = self._processes.submit(task, wait_s=_WAIT_S).result()
+        written = self._processes.run(
+            write_track,
+            given["name"] or f"drive {job.row.id}",
+            found.given(survey),
+            TrackRules(**options),
+            tuple(found.left_out),
+            tuple(found.on_lane),
+            tuple(found.warnings),
+            wait_s=_WAIT_S,
+        )
         job.report_progress(_WRITTEN)
         with staged(self._blobs) as stage:
             keys = {name: stage.put(_FOLDER, data) for name, data in written.files.items()}

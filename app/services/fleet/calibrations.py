@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from datetime import timedelta
 
 from app import __version__
 from app.calibration.board_view import CameraCalibration, ViewReport
 from app.calibration.calibrate import COEFFICIENTS, VERSION
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
-from app.formats.format import ArchiveLimits, SpooledFile
+from app.formats.format import SpooledFile
 from app.formats.images import ImageLimits
 from app.registry.column_types import new_id
 from app.registry.database import Database
@@ -27,22 +26,11 @@ from app.services.fleet.documents import (
     CalibrationView,
     CameraSigma,
 )
+from app.services.fleet.tasks import MAX_PHOTOS, calibrate_photos
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
-from app.services.ports import Clock, DecoderProcesses, Task
+from app.services.ports import Clock, DecoderProcesses
 
-MAX_PHOTOS = 60
 _BUSY_WAIT_S = 10.0
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationTask(Task[CameraCalibration]):
-    """Photos of a board to calibrate a camera with."""
-
-    photos: tuple[tuple[str, SpooledFile], ...]  # names and contents; a ZIP stands for the photos in it
-    board: CalibrationBoard
-    coefficients: int | None = None  # of the distortion
-    images: ImageLimits = field(default_factory=ImageLimits)  # of each photo
-    archives: ArchiveLimits = field(default_factory=lambda: ArchiveLimits(members=MAX_PHOTOS))
 
 
 class Calibrations:
@@ -103,8 +91,7 @@ class Calibrations:
         if coefficients is not None and coefficients not in COEFFICIENTS:
             raise InvalidParameter(f"{coefficients} coefficients", field="coefficients", limit="4, 5 or 8")
         _check_count(photos)
-        task = CalibrationTask(photos, board, coefficients, self._images)
-        found = self._processes.submit(task, wait_s=_BUSY_WAIT_S).result()
+        found = self._processes.run(calibrate_photos, photos, board, coefficients, self._images, wait_s=_BUSY_WAIT_S)
         result = calibration_result(found, board)
         row = CalibrationRow(id=new_id(now), who=caller.label, result=result, created_at=now)
         with write_once(self._database, caller.agency_id, key, now, self._ttl) as (connection, answer):

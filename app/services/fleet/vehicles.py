@@ -21,7 +21,7 @@ from app.registry.vehicles import CALIBRATIONS, VEHICLES, VehicleKeyRow, Vehicle
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
 from app.services.decodes.context import CameraSetup, ContextInput, DecodeContext, context_from_document
-from app.services.decodes.tasks import packet_terms, trace_terms
+from app.services.decodes.declarations import packet_terms, trace_terms
 from app.services.documents import document_of
 from app.services.fleet.documents import (
     VehicleDocument,

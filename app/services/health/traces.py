@@ -30,7 +30,7 @@ from app.sensors.magnetometer_bar import MagnetometerBar
 from app.sensors.pose_track import PoseTrack
 from app.services.decodes.matching import ReadPackets, horizontal_rmse_m
 from app.services.decodes.packet_documents import claimed_place
-from app.services.decodes.tasks import DriveFiles
+from app.services.decodes.packet_tasks import DriveFiles
 from app.services.health.record import EVIDENCE, MISSED, rounded
 
 # === What a packet log shows of the health of CERPMs: those it received, and those that it passed and did not receive.

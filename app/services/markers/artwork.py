@@ -35,8 +35,8 @@ from app.services.access.access import Caller
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.markers.searches import Selection, select_markers
-from app.services.markers.tasks import DrawPlateTask, WriteSheetsTask
-from app.services.plans.proofs import WAIT_S, tasks_in_order
+from app.services.markers.tasks import draw_plate, write_sheets
+from app.services.plans.proofs import WAIT_S, results_in_order
 from app.services.ports import Clock, DecoderProcesses, JobQueue
 from app.services.progress import JobDocument, JobFiles, job_document
 
@@ -245,20 +245,20 @@ class ArtworkJobs:
         with self._database.read() as connection:
             rows = select_markers(connection, job.row.agency_id, selection, PLATE.name, most=MAX_PLATES)
         orders = tuple(plate_order(row, page_url(self._public_url, row.id)) for row in rows)
-        tasks = (DrawPlateTask(*one, options) for one in zip(orders, plate_names(orders), strict=True))
+        plates_to_draw = ((*one, options) for one in zip(orders, plate_names(orders), strict=True))
         total, plates = len(orders), []
         job.report_progress(0.0, steps=(0, total))
         with TemporaryDirectory(prefix="waymark-artwork-") as folder:
             path = Path(folder) / "artwork.zip"
             with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
                 packer = Packer(archive)
-                with closing(tasks_in_order(self._processes, tasks, self._in_flight)) as drawn:
+                with closing(results_in_order(self._processes, draw_plate, plates_to_draw, self._in_flight)) as drawn:
                     for done, (files, entry) in enumerate(drawn, 1):
                         for name, content in files:
                             packer.add(name, content)
                         plates.append(entry)
                         job.report_progress(done / (total + 1), steps=(done, total))
-                sheets = self._processes.submit(WriteSheetsTask(orders, options), wait_s=WAIT_S).result()
+                sheets = self._processes.run(write_sheets, orders, options, wait_s=WAIT_S)
                 for name, content in sheets:
                     packer.add(name, content)
                 manifest = bundle_manifest(plates, list(packer.entries), options, proved=True)

@@ -27,7 +27,7 @@ from app.planning.predict.rates import CameraPass, CameraView, PassFrame, camera
 from app.planning.proof.report import Condition
 from app.planning.rules import CameraRules, PredictionRules
 from app.services.documents import document_of
-from app.services.markers.tasks import CameraViewTask
+from app.services.markers.tasks import render_camera_view
 from app.services.ports import DecoderProcesses
 
 # === Documents of plates that are not registered: their code and dimensions, and passes of a camera over them.
@@ -314,10 +314,17 @@ class PlateDrafts:
         """
         check_view_size(way.camera)
         _coded, order = self._order(draft)
-        task = CameraViewTask(
-            order.code, order.geometry, way.camera, way.speed_kmh / _KMH, ahead_m, way.left_m, condition
+        return self._processes.run(
+            render_camera_view,
+            order.code,
+            order.geometry,
+            way.camera,
+            way.speed_kmh / _KMH,
+            ahead_m,
+            way.left_m,
+            condition,
+            wait_s=_BUSY_WAIT_S,
         )
-        return self._processes.submit(task, wait_s=_BUSY_WAIT_S).result()
 
     def _order(self, draft: PlateDraft) -> tuple[CodedPlate, PlateOrder]:
         placed = None if draft.position is None else place_input(draft.position, self._accuracy_m)

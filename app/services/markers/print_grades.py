@@ -14,7 +14,7 @@ from app.planning.rules import CameraRules
 from app.registry import markers as store
 from app.registry.database import Database
 from app.services.access.access import Caller
-from app.services.markers.tasks import GradedPhoto, PrintGradeTask
+from app.services.markers.tasks import GradedPhoto, PrintedPlate, grade_photo
 from app.services.ports import Clock, DecoderProcesses
 
 _BUSY_WAIT_S = 10.0
@@ -78,12 +78,19 @@ class PrintGrades:
             raise error
         if photo.size > self._images.file_bytes:
             raise UploadTooLarge("the photo is too large", field="photo", limit=f"{self._images.file_bytes} bytes")
-        task = PrintGradeTask(
-            photo, self._clock(), code, geometry, declared.marker_id, declared.camera, declared.speed_kmh, as_pdf,
-            self._images,
-        )  # fmt: skip
+        plate = PrintedPlate(code, geometry, declared.marker_id)
         try:
-            return self._processes.submit(task, wait_s=_BUSY_WAIT_S).result()
+            return self._processes.run(
+                grade_photo,
+                photo,
+                self._clock(),
+                plate,
+                declared.camera,
+                declared.speed_kmh,
+                as_pdf,
+                self._images,
+                wait_s=_BUSY_WAIT_S,
+            )
         except UnreadableUpload as error:
             error.field = "photo" if error.field == FIELD else error.field  # the form's name of the file
             raise

@@ -1,46 +1,47 @@
-"""What decoder processes are asked to do for artwork, print grades and camera views: plain values."""
+"""Artwork, print grades and camera views of plates in a decoder process."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, ClassVar
+from typing import Any
 
 from app.encoders.plate import BundleOptions
+from app.encoders.plate.bundle import plate_files, sheet_files
 from app.encoders.plate.face import PlateOrder
 from app.formats.format import SpooledFile
-from app.formats.images import ImageLimits
+from app.formats.images import ImageLimits, load_image
 from app.markers.plate import PlateCode, PlateGeometry
 from app.planning.predict.rates import CameraView
 from app.planning.proof.report import Condition
 from app.planning.rules import CameraRules
-from app.services.markers.print_documents import PrintGradeDocument
-from app.services.ports import Task
-
-# === What decoder processes are asked to do for artwork of many plates.
-
+from app.services.decoder_tasks import decoder_task
+from app.services.markers.print_documents import NOTES, PrintGradeDocument, print_grade_document
+from app.services.plans.tasks import read_face
 
 Files = list[tuple[str, bytes]]
+_KMH = 3.6  # km/h in a metre a second
+
+
+@decoder_task("plate", "select fewer plates")
+def draw_plate(order: PlateOrder, name: str, options: BundleOptions) -> tuple[Files, dict[str, Any]]:
+    """Draw a plate, read it back, and write its files under this name: these, and its entry in the manifest."""
+    return plate_files(order, name, options, read_face)
+
+
+@decoder_task("sheet", "select fewer plates")
+def write_sheets(orders: tuple[PlateOrder, ...], options: BundleOptions) -> Files:
+    """Write the sheets to nest all plates on, and the quality sheets."""
+    return sheet_files(orders, options)
 
 
 @dataclass(frozen=True, slots=True)
-class DrawPlateTask(Task[tuple[Files, dict[str, Any]]]):
-    """A plate to draw, to prove and to write: its files, and its entry in the manifest."""
+class PrintedPlate:
+    """What is known of a printed plate."""
 
-    order: PlateOrder
-    name: str  # of the files, without extension
-    options: BundleOptions
-
-
-@dataclass(frozen=True, slots=True)
-class WriteSheetsTask(Task[Files]):
-    """Sheets to nest plates on, and the quality sheets."""
-
-    orders: tuple[PlateOrder, ...]
-    options: BundleOptions
-
-
-# === What decoder processes are asked to do for print grades, and what they return: plain values that can be pickled.
+    code: PlateCode | None  # what it should be; None: what the photo shows
+    geometry: PlateGeometry | None  # of the drawing
+    marker_id: str | None = None  # where the code and the geometry are from
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,37 +52,49 @@ class GradedPhoto:
     pdf: bytes = b""  # empty unless it was asked for
 
 
-@dataclass(frozen=True, slots=True)
-class PrintGradeTask(Task[GradedPhoto]):
-    """A photo of a printed plate to grade."""
+@decoder_task("photo", "send a photo of 12 megapixels or fewer", is_long=False)
+def grade_photo(
+    photo: SpooledFile,
+    at: datetime,
+    plate: PrintedPlate,
+    camera: CameraRules,
+    speed_kmh: float,
+    as_pdf: bool = False,
+    limits: ImageLimits = ImageLimits(),
+) -> GradedPhoto:
+    """Load a JPEG or PNG, grade the plate in it, and predict whether it is read at the design speed.
 
-    is_long: ClassVar[bool] = False
+    `at` is the time of the request.
+    """
+    from app.decoders.plate.print_grade import grade_print
+    from app.planning.predict.printed_plate import DesignSpeed, predict_print
+    from app.plots.print_report import PrintReport, write_print_report
 
-    photo: SpooledFile  # JPEG or PNG
-    at: datetime  # of the request
-    code: PlateCode | None  # what the plate should be; None: what the photo shows
-    geometry: PlateGeometry | None  # of the drawing
-    marker_id: str | None  # where the code and the geometry are from
-    camera: CameraRules
-    speed_kmh: float  # [km/h] design speed
-    as_pdf: bool = False
-    limits: ImageLimits = field(default_factory=ImageLimits)
+    frame = load_image(photo.read(), limits)
+    grade = grade_print(frame.pixels, code=plate.code, geometry=plate.geometry, focal_35mm=frame.header.focal_35mm)
+    design = DesignSpeed(camera, speed_kmh / _KMH)
+    prediction = predict_print(grade.reflectance, grade.code, grade.geometry, design)
+    document = print_grade_document(
+        grade, prediction, design, frame.header, sha256=photo.sha256, at=at, marker_id=plate.marker_id
+    )
+    if not as_pdf:
+        return GradedPhoto(document)
+    decoder, basis = document["decoder"], document["prediction"]["basis"]
+    report = PrintReport(grade, prediction, design, photo.sha256, at, plate.marker_id, decoder, basis, NOTES)
+    return GradedPhoto(document, write_print_report(report))
 
 
-# === What decoder processes are asked to do for pictures of what a camera sees: plain values that can be pickled.
+@decoder_task("picture", "choose a camera with fewer pixels", is_long=False)
+def render_camera_view(
+    code: PlateCode,
+    geometry: PlateGeometry,
+    camera: CameraRules,
+    speed_mps: float,
+    ahead_m: float,
+    left_m: float,
+    condition: Condition,
+) -> CameraView:
+    """Render a plate as a camera sees it, whose centre is so far ahead and to the left, and decode it."""
+    from app.planning.predict.printed_plate import render_view
 
-
-@dataclass(frozen=True, slots=True)
-class CameraViewTask(Task[CameraView]):
-    """A plate to render as a camera sees it, and to decode."""
-
-    is_long: ClassVar[bool] = False
-
-    code: PlateCode
-    geometry: PlateGeometry
-    camera: CameraRules
-    speed_mps: float
-    # `ahead_m`, `left_m`: [m] the plate's centre from the camera
-    ahead_m: float
-    left_m: float
-    condition: Condition
+    return render_view(code, geometry, camera, speed_mps=speed_mps, ahead_m=ahead_m, left_m=left_m, condition=condition)

@@ -24,7 +24,7 @@ from app.services.blobs import staged
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
 from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
-from app.services.plans.tasks import MapForm, ProfileRoadTask, RoadFile, SummarizeRoadTask, WriteMapTask
+from app.services.plans.tasks import MapForm, RoadFile, profile_road, summarize_road, write_map
 from app.services.ports import Blobs, Clock, DecoderProcesses
 
 BUSY_WAIT_S = 10.0
@@ -105,7 +105,7 @@ class Alignments:
         now, agency_id, name = self._clock(), caller.agency_id, road.name
         with self._database.read() as connection:
             ALIGNMENTS.check_name(connection, agency_id, name)
-        read = self._processes.submit(SummarizeRoadTask(road), wait_s=BUSY_WAIT_S).result()
+        read = self._processes.run(summarize_road, road, wait_s=BUSY_WAIT_S)
         with staged(self._blobs) as stage:
             source_key = stage.add("alignments", road.file)
             with (
@@ -157,8 +157,8 @@ class Alignments:
                 cure="send a bbox, a family or another filter, or cut the road into sections",
             )
         with self._blobs.opened(row.source_key) as file:
-            task = WriteMapTask(road_of(row, file, self._accuracy_m), form, tuple(found), within_m)
-            return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
+            road = road_of(row, file, self._accuracy_m)
+            return self._processes.run(write_map, road, form, tuple(found), within_m, wait_s=BUSY_WAIT_S)
 
     def profile(self, caller: Caller, alignment_id: str, samples: int) -> AlignmentProfile:
         """The lanes of an alignment to draw, with at most so many samples each.
@@ -171,8 +171,8 @@ class Alignments:
         with self._database.read() as connection:
             row = ALIGNMENTS.get(connection, caller.agency_id, alignment_id)
         with self._blobs.opened(row.source_key) as file:
-            task = ProfileRoadTask(road_of(row, file, self._accuracy_m), samples)
-            return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
+            road = road_of(row, file, self._accuracy_m)
+            return self._processes.run(profile_road, road, samples, wait_s=BUSY_WAIT_S)
 
     def get(self, caller: Caller, alignment_id: str) -> AlignmentDocument:
         """One alignment."""

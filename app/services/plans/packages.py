@@ -29,8 +29,8 @@ from app.services.blobs import delete_unused, staged
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S
-from app.services.plans.proofs import WAIT_S, PlanJobDocument, check_only_one, plan_job_document, tasks_in_order
-from app.services.plans.tasks import ListPartsTask, WriteManifestTask, WritePartTask
+from app.services.plans.proofs import WAIT_S, PlanJobDocument, check_only_one, plan_job_document, results_in_order
+from app.services.plans.tasks import check_package, list_package_parts, write_package_manifest, write_package_part
 from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue
 
 _FOLDER = "packages"
@@ -91,8 +91,8 @@ class Packages:
             return earlier, True
         with self._database.read() as connection:
             row = PLANS.get(connection, agency_id, plan_id)
-        check = ListPartsTask(self._blobs.get(row.document_key), package_options(options), only_check=True)
-        self._processes.submit(check, wait_s=BUSY_WAIT_S).result()
+        document = self._blobs.get(row.document_key)
+        self._processes.run(check_package, document, package_options(options), wait_s=BUSY_WAIT_S)
         job_input = {
             "document_key": row.document_key,
             "plan_version": row.version,
@@ -107,9 +107,9 @@ class Packages:
                 return answer.response, True
             check_only_one(connection, agency_id, JobKind.PACKAGE, plan_id)
             store.add_job(connection, job)
-            document = answer.store(plan_job_document(job))
+            response = answer.store(plan_job_document(job))
         self._queue.submit(job.id, job.agency_id, JobKind.PACKAGE)
-        return document, False
+        return response, False
 
     def open(self, caller: Caller, plan_id: str) -> StoredPackage:
         """The newest package of a plan.
@@ -142,17 +142,17 @@ class Packages:
     def _write(self, job: RunningJob, path: Path) -> int:
         """Write the ZIP part by part; returns the number of its files."""
         document, options = self._blobs.get(job.row.input["document_key"]), package_options(job.row.input["options"])
-        parts = self._processes.submit(ListPartsTask(document, options), wait_s=WAIT_S).result()
-        tasks = (WritePartTask(document, options, part) for part in parts)
+        parts = self._processes.run(list_package_parts, document, options, wait_s=WAIT_S)
+        arguments = ((document, options, part) for part in parts)
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             packer = Packer(archive)
-            with closing(tasks_in_order(self._processes, tasks, self._in_flight)) as written:
+            with closing(results_in_order(self._processes, write_package_part, arguments, self._in_flight)) as written:
                 for done, files in enumerate(written, 1):
                     for name, content in files:
                         packer.add(name, content)
                     job.report_progress(done / (len(parts) + 1), steps=(done, len(parts)))
-            manifest = WriteManifestTask(document, options, list(packer.entries))
-            packer.add(MANIFEST, self._processes.submit(manifest, wait_s=WAIT_S).result())
+            entries = list(packer.entries)
+            packer.add(MANIFEST, self._processes.run(write_package_manifest, document, options, entries, wait_s=WAIT_S))
         return len(packer.entries)
 
     def _store(self, job: RunningJob, path: Path, files: int) -> None:

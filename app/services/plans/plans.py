@@ -52,7 +52,7 @@ from app.services.plans.documents import (
     ProofSummary,
 )
 from app.services.plans.proofs import APPROVED, CHECKED, COMMITTED, DRAFT, PROVED, files_of
-from app.services.plans.tasks import CompareTask, MadePlan, MakePlanTask, WritePlanFileTask
+from app.services.plans.tasks import MadePlan, compare_plan, make_plan, write_file_of_plan
 from app.services.ports import Blobs, Clock, DecoderProcesses
 
 MAX_EXISTING = 200_000
@@ -314,8 +314,9 @@ class Plans:
             The CRS or the unit cannot be used.
         """
         row = self._get(caller, plan_id)
-        task = WritePlanFileTask(self._blobs.get(row.document_key), name, crs, unit)
-        return self._processes.submit(task, wait_s=BUSY_WAIT_S).result(), row.version
+        document = self._blobs.get(row.document_key)
+        content = self._processes.run(write_file_of_plan, document, name, crs, unit, wait_s=BUSY_WAIT_S)
+        return content, row.version
 
     def as_built(self, caller: Caller, plan_id: str) -> AsBuiltDocument:
         """A plan beside what was built and surveyed; nothing is, before it is committed.
@@ -334,8 +335,8 @@ class Plans:
                 road = ALIGNMENTS.get(connection, agency_id, row.alignment_id)
                 found = self._existing(connection, caller, road.summary["extent_deg"])
                 existing = tuple(marker for marker in found if marker.marker_id not in own)
-        task = CompareTask(self._blobs.get(row.document_key), tuple(built), existing)
-        return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
+        document = self._blobs.get(row.document_key)
+        return self._processes.run(compare_plan, document, tuple(built), existing, wait_s=BUSY_WAIT_S)
 
     def place(self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any]) -> MadePlan:
         """A plan with codes that no stored marker has, placed and checked; nothing is stored.
@@ -353,8 +354,9 @@ class Plans:
         with self._blobs.opened(row.source_key) as file:
             road = road_of(row, file, self._rules.crs_accuracy_m)
             for _ in range(_TRIES):
-                task = MakePlanTask(road, rules, name, frozenset(taken), existing, codebook)
-                made = self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
+                made = self._processes.run(
+                    make_plan, road, rules, name, frozenset(taken), existing, codebook, wait_s=BUSY_WAIT_S
+                )
                 with self._database.read() as connection:
                     found = self._taken(connection, caller.agency_id, made.numbers)
                 if not found:

@@ -6,13 +6,13 @@ import queue
 import threading
 import zlib
 from collections import deque
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from contextvars import copy_context
 from datetime import datetime, timedelta
 from functools import partial
-from typing import Annotated, Any, Literal, NotRequired, TypeVar, cast
+from typing import Annotated, Any, Literal, NotRequired, TypeVar, TypeVarTuple, cast
 
 import sqlalchemy as sa
 from pydantic import Field
@@ -32,28 +32,34 @@ from app.services.documents import ErrorDocument, document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S
-from app.services.plans.tasks import ListUnitsTask, ProveUnitTask, WriteProofTask, WrittenProof
-from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue, Pending, Task
+from app.services.plans.tasks import WrittenProof, check_proof, list_proof_units, prove_unit, write_proof
+from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue, Pending
 
 # === Many tasks of one job in the decoder processes, a limited number of them at the same time.
 
 
 KeyT = TypeVar("KeyT")
+ArgumentsT = TypeVarTuple("ArgumentsT")
 ResultT = TypeVar("ResultT")
 WAIT_S = 60.0
 """How long a job waits for a place among the tasks of the decoder processes before it is put back. [s]
 Source: chosen by hand, as decodes."""
 
 
-def tasks_as_done(
-    processes: DecoderProcesses, tasks: Iterable[tuple[KeyT, Task[ResultT]]], in_flight: int
+def results_as_done(
+    processes: DecoderProcesses,
+    task: Callable[[*ArgumentsT], ResultT],
+    arguments: Mapping[KeyT, tuple[*ArgumentsT]],
+    in_flight: int,
 ) -> Generator[tuple[KeyT, ResultT]]:
     """Results in the order in which they come. Those on their way are stopped where the caller goes no further.
 
     Parameters
     ----------
     processes : DecoderProcesses
-    tasks : iterable of (key, task)
+    task : callable
+    arguments : mapping of key to tuple
+        The task is carried out with each of them.
     in_flight : int
         Tasks that wait or are carried out at the same time; uploads of vehicles queue behind no more than these.
     """
@@ -61,7 +67,9 @@ def tasks_as_done(
     pool = ThreadPoolExecutor(in_flight, thread_name_prefix="plan-tasks")
     done: queue.SimpleQueue[Future[ResultT]] = queue.SimpleQueue()  # in the order in which they ended
     try:
-        futures = {pool.submit(copy_context().run, feeder.carry_out, task): key for key, task in tasks}
+        futures: dict[Future[ResultT], KeyT] = {}
+        for key, one in arguments.items():
+            futures[pool.submit(copy_context().run, feeder.carry_out, task, one)] = key
         for future in futures:
             future.add_done_callback(done.put)
         for _ in range(len(futures)):
@@ -73,12 +81,17 @@ def tasks_as_done(
         pool.shutdown()
 
 
-def tasks_in_order(processes: DecoderProcesses, tasks: Iterable[Task[ResultT]], in_flight: int) -> Generator[ResultT]:
-    """Results in the order of the tasks; otherwise as `tasks_as_done`. Only `in_flight` results are in memory."""
+def results_in_order(
+    processes: DecoderProcesses,
+    task: Callable[[*ArgumentsT], ResultT],
+    arguments: Iterable[tuple[*ArgumentsT]],
+    in_flight: int,
+) -> Generator[ResultT]:
+    """Results in the order of the arguments; otherwise as `results_as_done`. Only `in_flight` results are in memory."""
     waiting: deque[Pending[ResultT]] = deque()
     try:
-        for task in tasks:
-            waiting.append(processes.submit(task, wait_s=WAIT_S))
+        for one in arguments:
+            waiting.append(processes.submit(task, *one, wait_s=WAIT_S))
             if len(waiting) >= in_flight:
                 yield waiting.popleft().result()
         while waiting:
@@ -97,11 +110,11 @@ class _Feeder:
         self._running: set[Pending[Any]] = set()
         self._stopped = threading.Event()
 
-    def carry_out(self, task: Task[ResultT]) -> ResultT:
+    def carry_out(self, task: Callable[[*ArgumentsT], ResultT], arguments: tuple[*ArgumentsT]) -> ResultT:
         """Hand a task over and wait for its result."""
         if self._stopped.is_set():
             raise Unavailable("the job was stopped")
-        pending = self._processes.submit(task, wait_s=WAIT_S)
+        pending = self._processes.submit(task, *arguments, wait_s=WAIT_S)
         with self._lock:
             self._running.add(pending)
         if self._stopped.is_set():
@@ -320,8 +333,7 @@ class Proofs:
             return earlier, True
         with self._database.read() as connection:
             row = PLANS.get_at(connection, agency_id, plan_id, version)
-        check = ListUnitsTask(self._blobs.get(row.document_key), terms, only_check=True)
-        self._processes.submit(check, wait_s=BUSY_WAIT_S).result()
+        self._processes.run(check_proof, self._blobs.get(row.document_key), terms, wait_s=BUSY_WAIT_S)
         job_input = {
             "document_key": row.document_key,
             "plan_version": row.version,
@@ -366,18 +378,18 @@ class Proofs:
         terms = ProofTerms.model_validate(job.row.input["terms"])
         document = self._blobs.get(job.row.input["document_key"])
         results = self._drive(job, document, terms)
-        written = self._processes.submit(WriteProofTask(document, terms, results), wait_s=WAIT_S).result()
+        written = self._processes.run(write_proof, document, terms, results, wait_s=WAIT_S)
         self._store(job, written)
 
     def _drive(self, job: RunningJob, document: bytes, terms: ProofTerms) -> list[UnitResult]:
         """Results of all units; those that an earlier attempt finished are taken from the database."""
-        units = self._processes.submit(ListUnitsTask(document, terms), wait_s=WAIT_S).result()
+        units = self._processes.run(list_proof_units, document, terms, wait_s=WAIT_S)
         agency_id, job_id, total = job.row.agency_id, job.row.id, len(units)
         with self._database.read() as connection:
             results = cast("dict[int, UnitResult]", list_units(connection, agency_id, job_id))
         job.report_progress(len(results) / total, steps=(len(results), total))
-        tasks = ((k, ProveUnitTask(document, terms, unit)) for k, unit in enumerate(units) if k not in results)
-        with closing(tasks_as_done(self._processes, tasks, self._in_flight)) as done:
+        missing = {k: (document, terms, unit) for k, unit in enumerate(units) if k not in results}
+        with closing(results_as_done(self._processes, prove_unit, missing, self._in_flight)) as done:
             for number, result in done:
                 results[number] = result
                 keep = partial(add_unit, agency_id=agency_id, job_id=job_id, number=number, result=result)

@@ -1,30 +1,47 @@
-"""What decoder processes are asked to do for plans."""
+"""Roads and plans in a decoder process: read, placed, written, packed and proved, and what is shown of them."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
+import numpy.typing as npt
 import orjson
 
+from app.families import get_family
+from app.formats.alignments.geometry import AlignmentFile
+from app.formats.alignments.read import read_alignment
 from app.formats.format import SpooledFile
 from app.geodesy.systems import is_ellipsoidal
-from app.markers.reading import Verdict
+from app.markers.magnet_design import Codebook
+from app.markers.plate import PlateGeometry
+from app.markers.reading import PlateReading, Verdict
 from app.planning.alignment import Alignment, AlignmentDeclaration, Floats, Lane, RoadEvent
 from app.planning.outputs.bill import plan_bill
-from app.planning.outputs.package import PackageOptions, PackagePart
-from app.planning.outputs.plan_document import lane_points_deg
+from app.planning.outputs.hd_lanelet2 import write_lanelet2
+from app.planning.outputs.hd_map import map_of_road
+from app.planning.outputs.hd_opendrive import write_opendrive
+from app.planning.outputs.package import OutputOptions, Package, PackageOptions, PackagePart, write_plan_file
+from app.planning.outputs.plan_document import lane_points_deg, read_plan, write_plan
+from app.planning.placement.place import unused_numbers
 from app.planning.plan import Plan, PlanFinding, PlannedCerpm, PlannedLineMagnet, PlannedMarker
 from app.planning.plan_checks import ExistingMarker
-from app.planning.proof import ProofReport, ProofTerms, ProofUnit, UnitResult
+from app.planning.proof import ProofReport, ProofTerms, ProofUnit, UnitResult, summarize
+from app.planning.proof.report import markers_csv, report_document
+from app.planning.rules import RoadRules, check_rules
+from app.plots.track import draw_trade_off
 from app.registry.bulk_load import Columns
 from app.registry.marker_rows import MarkerRow
 from app.registry.plan_features import OF_MARKER
 from app.registry.plans import BuiltRow
+from app.services.decoder_tasks import decoder_task
 from app.services.documents import document_of
+from app.services.plans.as_built import compare_as_built
 from app.services.plans.documents import (
     AlignmentProfile,
     AsBuiltDocument,
@@ -41,7 +58,9 @@ from app.services.plans.documents import (
     RoadSummary,
     WeakMarker,
 )
-from app.services.ports import Task
+
+if TYPE_CHECKING:  # it loads numba
+    from app.planning.proof.prove import Prover
 
 # === Summaries of roads and plans, made where they are computed.
 
@@ -280,76 +299,13 @@ def _row(marker: PlannedMarker, datum: str | None) -> dict[str, Any]:
     return {**values, **at, "feature": text}
 
 
-# === What decoder processes are asked to do for packages of plans.
+# === Roads.
 
 
-@dataclass(frozen=True, slots=True)
-class ListPartsTask(Task[list[PackagePart]]):
-    """A package to divide into parts; of one that is only checked, the list is empty."""
-
-    document: bytes
-    options: PackageOptions
-    only_check: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class WritePartTask(Task[list[tuple[str, bytes]]]):
-    """A part of a package to write: names and contents of its files."""
-
-    document: bytes
-    options: PackageOptions
-    part: PackagePart
-
-
-@dataclass(frozen=True, slots=True)
-class WriteManifestTask(Task[bytes]):
-    """The manifest of a package to write."""
-
-    document: bytes
-    options: PackageOptions
-    entries: list[dict[str, Any]]
-
-
-# === What decoder processes are asked to do for proofs of plans.
-
-
-@dataclass(frozen=True, slots=True)
-class ListUnitsTask(Task[list[ProofUnit]]):
-    """A proof to divide into units; of one that is only checked, the list is empty."""
-
-    document: bytes
-    terms: ProofTerms
-    only_check: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class ProveUnitTask(Task[UnitResult]):
-    """A unit of a proof to drive."""
-
-    document: bytes
-    terms: ProofTerms
-    unit: ProofUnit
-
-
-@dataclass(frozen=True, slots=True)
-class WrittenProof:
-    """A finished proof."""
-
-    report: bytes  # JSON, as `app.planning.proof.report.report_document` makes it, compressed by zlib
-    table: bytes  # CSV with the markers that were driven over, compressed by zlib
-    summary: dict[str, Any]  # what the plan's document shows, as `ProofFigures`
-
-
-@dataclass(frozen=True, slots=True)
-class WriteProofTask(Task[WrittenProof]):
-    """A proof to report, from the results of all its units."""
-
-    document: bytes
-    terms: ProofTerms
-    results: list[UnitResult]
-
-
-# === What decoder processes are asked to do for plans.
+MapForm = Literal["osm", "xodr"]
+"""Formats of HD maps by the ends of their files' names: lanelet2 and OpenDRIVE."""
+_ROAD = ("road", "cut the road into sections")
+_PLAN = ("plan", "cut the road into sections")
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,33 +327,39 @@ class SummarizedRoad:
     lanes: list[LaneFeature]
 
 
-@dataclass(frozen=True, slots=True)
-class SummarizeRoadTask(Task[SummarizedRoad]):
-    """A road to read: its lanes, events, warnings and extent."""
-
-    road: RoadFile
-
-
-@dataclass(frozen=True, slots=True)
-class ProfileRoadTask(Task[AlignmentProfile]):
-    """A road to draw: its lanes with at most so many samples each."""
-
-    road: RoadFile
-    samples: int
+@decoder_task(*_ROAD)
+def summarize_road(road: RoadFile) -> SummarizedRoad:
+    """Read a road: its lanes, events, warnings and extent."""
+    file = read_alignment(road.file.read(), road.file_name)
+    alignment = _build(file, road, None)
+    return SummarizedRoad(dict(road_summary(alignment, file.format)), lane_features(alignment))
 
 
-MapForm = Literal["osm", "xodr"]
-"""Formats of HD maps by the ends of their files' names."""
+@decoder_task(*_ROAD)
+def profile_road(road: RoadFile, samples: int) -> AlignmentProfile:
+    """Read a road to draw it: its lanes with at most so many samples each."""
+    return alignment_profile(_build(read_alignment(road.file.read(), road.file_name), road, None), samples)
 
 
-@dataclass(frozen=True, slots=True)
-class WriteMapTask(Task[bytes]):
-    """An HD map to write: a road, and the markers near it."""
+@decoder_task(*_ROAD)
+def write_map(road: RoadFile, form: MapForm, markers: tuple[MarkerRow, ...], within_m: float) -> bytes:
+    """Write a road as an HD map, with those of the markers that are near the centre line of a lane."""
+    alignment = _build(read_alignment(road.file.read(), road.file_name), road, None)
+    points = [point for row in markers for point in get_family(row.family).map_markers(row)]
+    content = map_of_road(alignment, points, within_m=within_m)
+    return write_lanelet2(content) if form == "osm" else write_opendrive(content, leave_out=True)
 
-    road: RoadFile
-    form: MapForm  # ``osm`` for lanelet2, ``xodr`` for OpenDRIVE
-    markers: tuple[MarkerRow, ...]  # of the registry; those that are farther from the road are left out
-    within_m: float  # [m] greatest distance of a marker from the centre line of a lane
+
+def _build(file: AlignmentFile, road: RoadFile, rules: RoadRules | None) -> Alignment:
+    """Without the rules of a plan, lanes whose speed the file does not state have none."""
+    from app.planning.build_alignment import build_alignment
+
+    return build_alignment(
+        file, rules, road.declaration, name=road.name, accuracy_m=road.accuracy_m, needs_speed=rules is not None
+    )
+
+
+# === Plans.
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,36 +368,147 @@ class MadePlan:
 
     document: bytes  # as `app.planning.outputs.plan_document.write_plan` writes it, compressed by zlib
     summary: dict[str, Any]  # what lists and the plan's page show
-    numbers: tuple[tuple[str, str], ...]  # codes that no other marker may have
+    numbers: tuple[tuple[str, str], ...]  # (family, code), which no other marker may have
     features: Columns  # the markers for GIS clients
 
 
+@decoder_task(*_ROAD)
+def make_plan(
+    road: RoadFile,
+    rules: dict[str, Any],
+    name: str,
+    taken: frozenset[int] = frozenset(),
+    existing: tuple[ExistingMarker, ...] = (),
+    codebook: dict[str, Any] | None = None,
+) -> MadePlan:
+    """Place and check a plan.
+
+    Parameters
+    ----------
+    road : RoadFile
+    rules : dict
+    name : str
+    taken : frozenset of int
+        Registry numbers that other markers have.
+    existing : tuple of ExistingMarker
+        Markers of the registry near the road.
+    codebook : dict or None
+        Document of the agency's codebook.
+    """
+    from app.planning import planner
+
+    checked = check_rules(rules)
+    alignment = _build(read_alignment(road.file.read(), road.file_name), road, checked.road)
+    numbers = unused_numbers(taken, zlib.crc32(name.encode()))
+    book = Codebook.from_document(codebook) if codebook is not None else None
+    plan = planner.make_plan(alignment, checked, name=name, codebook=book, numbers=numbers, existing=existing)
+    codes = tuple((marker.family, marker.code) for marker in plan.markers if marker.family != "magnet")
+    return MadePlan(zlib.compress(write_plan(plan), 6), plan_summary(plan), codes, planned_columns(plan))
+
+
+@decoder_task(*_PLAN)
+def write_file_of_plan(document: bytes, name: str, crs: str | None = None, unit: str | None = None) -> bytes:
+    """Write a file of a plan; CRS and unit are those of the stakeout."""
+    options = OutputOptions(crs, unit, draw_trade_off=draw_trade_off)
+    return write_plan_file(_plan(document), name, options)
+
+
+@decoder_task(*_PLAN)
+def compare_plan(document: bytes, built: tuple[BuiltRow, ...], existing: tuple[ExistingMarker, ...]) -> AsBuiltDocument:
+    """Compare a committed plan with the markers that it became, and with others of the registry near the road."""
+    return compare_as_built(_plan(document), built, existing)
+
+
+def _plan(document: bytes) -> Plan:
+    return read_plan(zlib.decompress(document))
+
+
+# === Packages of plans.
+
+
+@decoder_task(*_PLAN)
+def check_package(document: bytes, options: PackageOptions) -> None:
+    """Check that the options of a package fit the plan."""
+    _package(document, options).check()
+
+
+@decoder_task(*_PLAN)
+def list_package_parts(document: bytes, options: PackageOptions) -> list[PackagePart]:
+    """Check a package, and divide it into parts."""
+    package = _package(document, options)
+    package.check()
+    return package.parts()
+
+
+@decoder_task(*_PLAN)
+def write_package_part(document: bytes, options: PackageOptions, part: PackagePart) -> list[tuple[str, bytes]]:
+    """Write a part of a package: names and contents of its files."""
+    return _package(document, options).write(part, read_face)
+
+
+@decoder_task(*_PLAN)
+def write_package_manifest(document: bytes, options: PackageOptions, entries: list[dict[str, Any]]) -> bytes:
+    """Write the manifest of a package."""
+    return _package(document, options).manifest(entries)
+
+
+def read_face(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> Sequence[PlateReading]:
+    """The plate decoder as the self-proof of artwork wants it."""
+    from app.decoders.plate.reader import decode_plates
+
+    return decode_plates(image, geometries=(geometry,))
+
+
+@lru_cache(maxsize=1)
+def _package(document: bytes, options: PackageOptions) -> Package:
+    """A plan with what its parts share: one a process, kept until another plan is packed."""
+    return Package(_plan(document), options)
+
+
+# === Proofs of plans.
+
+
 @dataclass(frozen=True, slots=True)
-class MakePlanTask(Task[MadePlan]):
-    """A plan to place and to check."""
+class WrittenProof:
+    """A finished proof."""
 
-    road: RoadFile
-    rules: dict[str, Any]
-    name: str
-    taken: frozenset[int] = frozenset()  # registry numbers that other markers have
-    existing: tuple[ExistingMarker, ...] = ()  # markers of the registry near the road
-    codebook: dict[str, Any] | None = None  # document of the agency's codebook
+    report: bytes  # JSON of `app.planning.proof.report.report_document`, compressed by zlib
+    table: bytes  # CSV with the markers that were driven over, compressed by zlib
+    summary: dict[str, Any]  # what the plan's document shows, as `ProofFigures`
 
 
-@dataclass(frozen=True, slots=True)
-class WritePlanFileTask(Task[bytes]):
-    """A file of a plan to write: its name, and CRS and unit of the stakeout."""
-
-    document: bytes
-    name: str
-    crs: str | None = None
-    unit: str | None = None
+@decoder_task(*_PLAN)
+def check_proof(document: bytes, terms: ProofTerms) -> None:
+    """Check that a plan has something to prove, and not too much."""
+    _prover(document, terms).check_size()
 
 
-@dataclass(frozen=True, slots=True)
-class CompareTask(Task[AsBuiltDocument]):
-    """A committed plan to compare with the markers that it became."""
+@decoder_task(*_PLAN)
+def list_proof_units(document: bytes, terms: ProofTerms) -> list[ProofUnit]:
+    """Check a proof, and divide it into units."""
+    prover = _prover(document, terms)
+    prover.check_size()
+    return prover.list_units()
 
-    document: bytes
-    built: tuple[BuiltRow, ...]
-    existing: tuple[ExistingMarker, ...]  # other markers of the registry near the road
+
+@decoder_task(*_PLAN)
+def prove_unit(document: bytes, terms: ProofTerms, unit: ProofUnit) -> UnitResult:
+    """Drive a unit of a proof."""
+    return _prover(document, terms).prove_unit(unit)
+
+
+@decoder_task(*_PLAN)
+def write_proof(document: bytes, terms: ProofTerms, results: list[UnitResult]) -> WrittenProof:
+    """Write the report of a proof from the results of all its units."""
+    report = summarize(_prover(document, terms).plan, terms, results)
+    text = orjson.dumps(report_document(report), option=orjson.OPT_SERIALIZE_NUMPY)
+    table = markers_csv(report).encode()
+    return WrittenProof(zlib.compress(text, 6), zlib.compress(table, 6), proof_figures(report, results))
+
+
+@lru_cache(maxsize=1)
+def _prover(document: bytes, terms: ProofTerms) -> Prover:
+    """A plan with what its units share: one a process, kept until another plan is proved."""
+    from app.planning.proof.prove import Prover
+
+    return Prover(_plan(document), terms)

@@ -8,15 +8,12 @@ import hmac
 import re
 import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from typing import ClassVar, Literal, NamedTuple, NotRequired
+from typing import Literal, NamedTuple, NotRequired
 
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, NotFound
-from app.formats.format import SpooledFile
-from app.formats.images import ImageLimits
 from app.markers.reading import Status
 from app.registry import public_pages as store
 from app.registry.database import Database
@@ -26,7 +23,7 @@ from app.registry.resources import check_version
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
 from app.services.documents import document_of
-from app.services.ports import Clock, Task
+from app.services.ports import Clock
 
 # === Tokens of forms that need no key: signed, for one marker, and valid for some hours.
 #
@@ -204,24 +201,6 @@ def damage_report_document(row: ReportRow) -> DamageReport:
 def contact_document(row: ContactRow) -> ReportContact:
     """A contact as clients see it."""
     return document_of(ReportContact, row)
-
-
-# === What a decoder process is asked to do with the photo of a damage report.
-
-
-MAX_SIDE_PX = 2048
-"""Longest side of the stored photo. [px] Source: chosen by hand: damage is seen, and a photo takes 0.5 MB."""
-JPEG_QUALITY = 85
-
-
-@dataclass(frozen=True, slots=True)
-class ReportPhotoTask(Task[bytes]):
-    """A photo to decode and to write again as a JPEG: upright, smaller, and without metadata."""
-
-    is_long: ClassVar[bool] = False
-
-    photo: SpooledFile  # JPEG or PNG
-    limits: ImageLimits
 
 
 # === What everybody may see of a marker, and what an agency releases.

@@ -30,10 +30,10 @@ from app.services.public_pages.pages import (
     PublicMarker,
     ReportContact,
     ReportKind,
-    ReportPhotoTask,
     contact_document,
     damage_report_document,
 )
+from app.services.public_pages.tasks import write_report_photo
 from app.services.uploads.quotas import Quotas
 
 MAX_NEW_OF_MARKER, MAX_NEW_OF_AGENCY = 20, 2000
@@ -110,9 +110,8 @@ class DamageReports:
             error = unknown_picture(head)
             error.field = "photo"
             raise error
-        task = ReportPhotoTask(photo, self._images)
         try:
-            return self._processes.submit(task, wait_s=_BUSY_WAIT_S).result()
+            return self._processes.run(write_report_photo, photo, self._images, wait_s=_BUSY_WAIT_S)
         except WaymarkError as error:
             if error.field == FIELD:
                 error.field = "photo"  # the form's name of the file

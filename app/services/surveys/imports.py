@@ -18,10 +18,9 @@ from app.errors import InvalidParameter
 from app.families import get_family
 from app.families.family import Registration
 from app.families.surveys import PLANNED, MarkerRules, RowCodes, Rows, SurveyImport
-from app.formats.format import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
-from app.formats.surveys.table import Fault, Faults, Severity, SurveyTable
+from app.formats.surveys.table import Fault, Faults, Severity
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, EntryRow, find_head, recording
 from app.registry.bulk_load import LARGE, Columns
@@ -32,7 +31,7 @@ from app.services.access.access import Caller
 from app.services.access.audit import author_of
 from app.services.documents import kind_of_change, kind_of_new
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
-from app.services.ports import Clock, DecoderProcesses, Task
+from app.services.ports import Clock, DecoderProcesses
 from app.services.roads.documents import linear_references
 from app.services.surveys.import_report import (
     ALL,
@@ -53,6 +52,7 @@ from app.services.surveys.import_rows import (
     places_of,
     survey_box,
 )
+from app.services.surveys.tasks import read_survey_file
 from app.surveys.comparison import Comparison, RegisteredPoints, check_residuals, compare_survey, find_duplicates
 from app.surveys.consistency_checks import check_accuracy, check_consistency
 from app.surveys.georeference import (
@@ -69,15 +69,6 @@ READ, SETTLED = 0.3, 0.5
 _BUSY_WAIT_S = 10.0
 _PART = 2000  # rows that are stored at a time
 _ALWAYS_WARNED = {"place_by_area_only"}  # every survey of a new road gets this warning, however well it is declared
-
-
-@dataclass(frozen=True, slots=True)
-class SurveyTask(Task[SurveyTable]):
-    """A survey to read."""
-
-    file: SpooledFile
-    declaration: ImportDeclaration
-    code_form: CodeForm
 
 
 class Imports:
@@ -125,10 +116,10 @@ class Imports:
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
-        pending = self._processes.submit(
-            SurveyTask(given.file, given.declaration, _code_form(given)), wait_s=_BUSY_WAIT_S
+        table = self._processes.run(
+            read_survey_file, given.file, given.declaration, _code_form(given), wait_s=_BUSY_WAIT_S
         )
-        table, grid = apply_local_grid(pending.result(), given.declaration)
+        table, grid = apply_local_grid(table, given.declaration)
         table = without_rows(table, given.declaration.leave_out)
         survey = georeference_survey(table, given.declaration, self._rules.crs_accuracy_m)
         step(READ)

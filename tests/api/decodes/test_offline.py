@@ -26,13 +26,13 @@ from app.demo.cerpms import build_lane
 from app.formats.format import SpooledFile
 from app.formats.traces.read import read_trace
 from app.geodesy import decimal_year, move_to_epoch
-from app.jobs.drive_tasks import read_drive
 from app.lanes.estimate import fit_lane
 from app.lanes.types import LaneMarkers
 from app.main import create_app
 from app.markers.snapshot import Trust
 from app.services.access.access import Scope
-from app.services.decodes.tasks import DriveTask, trace_terms
+from app.services.decodes.declarations import trace_terms
+from app.services.decodes.packet_tasks import read_drive
 from app.settings import Settings
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.radio.attacks import number_entries
@@ -172,7 +172,7 @@ def test_packets_give_the_same_verdicts_markers_and_lane(real_server: LiveServer
         packets = number_entries([*later.packets, *again])
         online = decoded(client, packed(later, packets))
 
-    files = read_drive(DriveTask("drive.zip", SpooledFile.of(packed(later, packets)), {}), None)
+    files = read_drive("drive.zip", SpooledFile.of(packed(later, packets)), {})
     known = snapshot.known_cerpms(list_numbers(files.packets))
     freshness = FreshnessRules(uploaded_at_s=datetime.now(UTC).timestamp())
     verification, merged = match_known_markers(files.packets, built.keys, known, files.track, freshness)

@@ -16,7 +16,7 @@ import pytest
 
 from app.errors import Unavailable
 from app.registry.jobs import JobKind
-from app.services.plans.tasks import WritePartTask
+from app.services.plans.tasks import write_package_part
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer
 from tests.http import created, finished, refused
@@ -55,11 +55,14 @@ class Watched:
         self._processes, self._before = processes, before
         self._parts = 0
 
-    def submit(self, task: Any, *, wait_s: float = 0.0) -> Any:
-        if isinstance(task, WritePartTask):
+    def submit(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
+        if task is write_package_part:
             self._before(self._parts)
             self._parts += 1
-        return self._processes.submit(task, wait_s=wait_s)
+        return self._processes.submit(task, *arguments, wait_s=wait_s)
+
+    def run(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
+        return self.submit(task, *arguments, wait_s=wait_s).result()
 
 
 def blobs_of(server: LiveServer) -> set[Path]:

@@ -16,7 +16,7 @@ from app.main import create_app
 from app.planning.proof import prove
 from app.registry.agencies import agencies
 from app.registry.jobs import JobKind
-from app.services.plans.tasks import ProveUnitTask, WriteProofTask
+from app.services.plans.tasks import prove_unit, write_proof
 from app.settings import Settings
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
@@ -75,11 +75,14 @@ class Watched:
         self._processes, self._before = processes, before
         self.units = 0
 
-    def submit(self, task: Any, *, wait_s: float = 0.0) -> Any:
-        if isinstance(task, ProveUnitTask):
+    def submit(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
+        if task is prove_unit:
             self._before(self.units)
             self.units += 1
-        return self._processes.submit(task, wait_s=wait_s)
+        return self._processes.submit(task, *arguments, wait_s=wait_s)
+
+    def run(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
+        return self.submit(task, *arguments, wait_s=wait_s).result()
 
 
 def prove_plan(client: httpx.Client, plan: dict[str, Any], **more: str) -> httpx.Response:
@@ -307,10 +310,14 @@ def test_a_draft_stays_a_draft_and_a_wrong_reading_takes_the_proof_back(
     processes = proofs._processes
 
     class Misreading:
-        def submit(self, task: Any, *, wait_s: float = 0.0) -> Any:
-            if isinstance(task, WriteProofTask) and wrong:
-                task.results[0]["wrong"].append({"marker": 1, "text": "0000000000ab"})
-            return processes.submit(task, wait_s=wait_s)
+        def submit(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
+            return processes.submit(task, *arguments, wait_s=wait_s)
+
+        def run(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
+            if task is write_proof and wrong:
+                _document, _terms, results = arguments
+                results[0]["wrong"].append({"marker": 1, "text": "0000000000ab"})
+            return self.submit(task, *arguments, wait_s=wait_s).result()
 
     for version, misread in ((1, False), (2, True)):
         monkeypatch.setattr(proofs, "_processes", Misreading() if misread else processes)

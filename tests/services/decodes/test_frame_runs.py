@@ -5,8 +5,8 @@ from __future__ import annotations
 from app.errors import UnreadableUpload
 from app.formats.format import SpooledFile
 from app.services.decodes.context import DecodeContext
+from app.services.decodes.frame_tasks import FramePicture
 from app.services.decodes.frames import RUN_BYTES, RUN_FRAMES, RUN_PIXELS, ArchiveFrame, FrameMoment, in_runs
-from app.services.decodes.tasks import FramePicture
 
 
 def _frame(index: int, pixels: int = 1000, size: int = 1000) -> ArchiveFrame:

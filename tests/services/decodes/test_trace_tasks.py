@@ -12,16 +12,15 @@ import gc
 from pathlib import Path
 from numba.core.registry import CPUDispatcher
 from app.formats.format import SpooledFile
-from app.jobs.drive_tasks import compile_traces, decode_recording
-from app.services.decodes.tasks import CompileTracesTask, TraceTask
+from app.services.decodes.trace_tasks import compile_traces, decode_recording
 
 def compiled():
     kernels = [found for found in gc.get_objects() if isinstance(found, CPUDispatcher)]
     return sum(len(kernel.signatures) for kernel in kernels if kernel.py_func.__module__.startswith("app.decoders"))
 
-compile_traces(CompileTracesTask(), None)
+compile_traces()
 before = compiled()
-decode_recording(TraceTask("drive.zip", SpooledFile.of(Path("docs/images/drive.zip").read_bytes()), {}), None)
+decode_recording("drive.zip", SpooledFile.of(Path("docs/images/drive.zip").read_bytes()), {})
 print(before, compiled())
 """
 

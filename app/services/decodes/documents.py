@@ -1,0 +1,156 @@
+"""Decodes as clients see them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Annotated, Any, NotRequired, cast
+
+from pydantic import Field, JsonValue
+from typing_extensions import TypedDict
+
+from app.registry.decodes import DecodeRow
+from app.registry.jobs import JobState
+from app.services.decodes.context import DecodeKind
+from app.services.decodes.frame_documents import (
+    AnyReading,
+    FixDocument,
+    FrameDocument,
+    FrameSummary,
+    SeenPlateDocument,
+)
+from app.services.decodes.frame_poses import GapDocument, ReceiverPositions
+from app.services.decodes.lane_documents import DecodedLaneDocument, OverlayDocument, SteeringDocument
+from app.services.decodes.packet_documents import (
+    PacketReportDocument,
+    PacketSummary,
+    PathLossDocument,
+    ReceivedMarkerDocument,
+)
+from app.services.decodes.trace_documents import (
+    CrossingDocument,
+    NoiseDocument,
+    PassedMagnetDocument,
+    TagDocument,
+    TagFixDocument,
+    TraceMotionDocument,
+    TraceReportDocument,
+    TraceSummary,
+)
+from app.services.documents import ErrorDocument
+
+
+class DecodeLinks(TypedDict):
+    """Paths of the decode and of what can be drawn from it."""
+
+    self: str
+    annotated: NotRequired[str]
+    samples: NotRequired[str]
+    packets: NotRequired[str]
+    track: NotRequired[str]
+    readings: NotRequired[str]
+    plot: NotRequired[str]
+    lane: NotRequired[str]
+    overlay: NotRequired[str]
+
+
+class DecodeHead(TypedDict):
+    """A decode without its result."""
+
+    id: str
+    state: JobState
+    kind: DecodeKind
+    progress: Annotated[float, Field(description="0 to 1.")]
+    attempts: int
+    created_at: datetime
+    finished_at: datetime | None
+    context: Annotated[dict[str, JsonValue], Field(description="What was declared of the upload.")]
+    file_name: Annotated[str | None, Field(description="Of the uploaded file, if it had one.")]
+    upload_bytes: Annotated[int | None, Field(description="Size of the upload; null of those of older versions.")]
+    error: ErrorDocument | None
+    links: DecodeLinks
+
+
+class DecodeDocument(DecodeHead):
+    """A decode. `decoder` and what follows it are there once it is done, or as far as it is done: then `partial`."""
+
+    partial: NotRequired[Annotated[bool, Field(description="The decode goes on; this is its result so far.")]]
+
+    decoder: NotRequired[str]
+    summary: NotRequired[FrameSummary | TraceSummary | PacketSummary]
+    codebook_plates: NotRequired[int]
+    readings: NotRequired[list[AnyReading]]
+    frames: NotRequired[list[FrameDocument]]
+    plates: NotRequired[list[SeenPlateDocument]]
+    gaps: NotRequired[list[GapDocument]]
+    receiver: NotRequired[ReceiverPositions | None]
+    warnings: NotRequired[list[str]]
+    fix: NotRequired[FixDocument | TagFixDocument | None]
+    codebook_tags: NotRequired[int]
+    report: NotRequired[TraceReportDocument | PacketReportDocument]
+    tags: NotRequired[list[TagDocument]]
+    crossings: NotRequired[list[CrossingDocument]]
+    magnets: NotRequired[list[PassedMagnetDocument]]
+    noise: NotRequired[list[NoiseDocument]]
+    motion: NotRequired[TraceMotionDocument]
+    markers: NotRequired[list[ReceivedMarkerDocument]]
+    lane: NotRequired[DecodedLaneDocument]
+    steering: NotRequired[SteeringDocument | None]
+    overlay: NotRequired[OverlayDocument | None]
+    path_loss: NotRequired[PathLossDocument | None]
+
+
+class DecodePage(TypedDict):
+    """A page of decodes without their results, newest first; the Link header leads to the next one."""
+
+    items: list[DecodeHead]
+
+
+def decode_document(row: DecodeRow) -> DecodeDocument:
+    """A decode with its result, once there is one."""
+    so_far = {"partial": True} if row.state == "running" and row.result else {}
+    return cast("DecodeDocument", {**decode_head(row), **so_far, **(row.result or {})})
+
+
+def decode_head(row: DecodeRow) -> DecodeHead:
+    """A decode without its result."""
+    return {
+        "id": row.id,
+        "state": row.state,
+        "kind": DecodeKind(row.kind),
+        "progress": row.progress,
+        "attempts": row.attempts,
+        "created_at": row.created_at,
+        "finished_at": row.finished_at,
+        "context": {name: value for name, value in row.context.items() if name != "file_name"},
+        "file_name": _file_name(row.context),
+        "upload_bytes": row.upload_bytes,
+        "error": cast("ErrorDocument | None", row.error),
+        "links": _links(f"/v1/decodes/{row.id}", row.kind, row.result or {}),
+    }
+
+
+def _file_name(context: Mapping[str, Any]) -> str | None:
+    declared = context.get("trace") or context.get("packets") or {}
+    return context.get("file_name") or declared.get("file_name")
+
+
+def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:
+    links: DecodeLinks = {"self": path}
+    frames = [frame["frame"] for frame in result.get("frames", ()) if frame["error"] is None]
+    if kind in (DecodeKind.FRAME, DecodeKind.ARCHIVE):
+        links["annotated"] = f"{path}/annotated.jpg"
+    elif kind == DecodeKind.VIDEO and frames:
+        links["annotated"] = f"{path}/annotated.jpg?frame={frames[0]}"
+    elif kind != DecodeKind.VIDEO:
+        links["plot"] = f"{path}/plot.svg"
+    if kind == DecodeKind.TRACE:
+        links["samples"] = f"{path}/samples"
+    if kind == DecodeKind.PACKETS:
+        links["lane"] = f"{path}/lane.geojson"
+        links["packets"] = f"{path}/packets"
+        if result.get("overlay"):
+            links["overlay"] = f"{path}/overlay.jpg"
+    if result:
+        links["track"], links["readings"] = f"{path}/track.geojson", f"{path}/readings.geojson"
+    return links

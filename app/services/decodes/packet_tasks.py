@@ -1,0 +1,218 @@
+"""Packet logs of CERPMs in a decoder process: read, and a lane estimated through their markers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from app.errors import InvalidParameter, UnreadableUpload, naming
+from app.formats.format import SpooledFile
+from app.formats.images import ImageHeader, ImageLimits, inspect_image, load_image
+from app.formats.kinds import detect_drive_file
+from app.formats.logs import LogReport
+from app.formats.packets.read import read_packets
+from app.formats.packets.rows import PacketLimits
+from app.formats.poses import read_poses
+from app.formats.traces.declaration import TraceLimits
+from app.formats.traces.parts import open_parts
+from app.lanes.overlay import LaneOverlay, VehiclePose, lane_in_frame, ned_from_enu
+from app.lanes.smooth_line import plane_from_wgs84
+from app.lanes.types import Lane, LaneMarkers
+from app.plots.annotated_frame import draw_lane, encode_picture
+from app.plots.lane import SignalPicture, picture_of_lane, plot_lane
+from app.sensors.camera import Camera
+from app.sensors.pose_track import PoseTrack, ReceivedPacket
+from app.services.decoder_tasks import decoder_task
+from app.services.decodes.declarations import PacketTerms, packet_terms
+
+if TYPE_CHECKING:  # they load numba
+    from app.lanes.control import Controller
+    from app.simulation.steering import SteeringCheck
+
+_LOG = ("log", "cut the log into shorter ones")
+
+# === Reading.
+
+
+@dataclass(frozen=True, slots=True)
+class DriveFiles:
+    """What the files of a drive hold."""
+
+    packets: list[ReceivedPacket]  # of all packet logs; entries go on counting from file to file
+    track: PoseTrack | None
+    reports: dict[str, LogReport]  # about reading each file
+    frame: tuple[str, ImageHeader] | None  # name and header of the camera frame
+    load_ms: float
+    driven_m: float | None = None  # along the track
+
+
+@decoder_task(*_LOG)
+def read_drive(
+    name: str,
+    file: SpooledFile,
+    declared: Mapping[str, Any],
+    limits: PacketLimits = PacketLimits(),
+    images: ImageLimits = ImageLimits(),
+) -> DriveFiles:
+    """Read the files of a drive: a packet log, or a ZIP of packet logs, poses and a camera frame.
+
+    `declared` is the declaration as it was sent; see `packet_terms`.
+    """
+    began = time.perf_counter()
+    terms = packet_terms(declared)
+    packets: list[ReceivedPacket] = []
+    track: PoseTrack | None = None
+    frame: tuple[str, ImageHeader] | None = None
+    reports: dict[str, LogReport] = {}
+    with file.open() as stream:
+        for part in open_parts({name: stream}, TraceLimits(file_bytes=limits.file_bytes)):
+            if part.name.startswith("."):
+                continue  # what a desktop leaves in a ZIP
+            data = part.content()
+            kind = terms.files.get(part.name) or detect_drive_file(part.name, data)
+            if kind == "frame":
+                if frame is not None:
+                    raise _twice("camera frame", part.name)
+                frame = (part.name, inspect_image(data, images))
+            elif kind == "poses":
+                if track is not None:
+                    raise _twice("track", part.name)
+                with naming("packets"):
+                    track, reports[part.name] = read_poses(part.name, data, terms.poses)
+            else:
+                with naming("packets"):
+                    log = read_packets(part.name, data, terms.packets, limits)
+                first = sum(report.entries for read_name, report in reports.items() if read_name != part.name)
+                packets += [replace(packet, entry=packet.entry + first) for packet in log.packets]
+                reports[part.name] = log.report
+    if not packets:
+        raise UnreadableUpload(
+            "there is no packet log in the upload",
+            field="file",
+            limit="one packet log at least",
+            cure="declare which file it is in packets.files if its content does not show it",
+        )
+    driven_m = None if track is None else round(track.driven_m(), 2)
+    return DriveFiles(packets, track, reports, frame, 1e3 * (time.perf_counter() - began), driven_m)
+
+
+def _twice(what: str, name: str) -> UnreadableUpload:
+    return UnreadableUpload(
+        f"{name} is a second {what}",
+        field="file",
+        limit=f"one {what} in an upload",
+        cure="send each drive by itself, or name the kinds of its files in packets.files",
+    )
+
+
+# === The lane.
+
+
+_DEFAULT_SPEED_KM_H = 50.0
+Pose = tuple[float, float, float]
+"""Longitude, latitude and heading of a vehicle. [deg]"""
+LeftOutMarker = tuple[int, float, float, str]
+"""Number of a marker, longitude and latitude that it claims [deg], and why it was left out."""
+
+
+class PosedCamera(NamedTuple):
+    """The camera of a frame, and where the vehicle was when it was taken."""
+
+    camera: Camera
+    pose: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaneResult:
+    """The lane and what follows from it."""
+
+    lane: Lane
+    steering: SteeringCheck | str | None  # the check, or why it could not be made
+    overlay: LaneOverlay | None
+    plot: bytes  # SVG
+    decode_ms: float
+
+
+@decoder_task(*_LOG)
+def estimate_lane(
+    markers: LaneMarkers,
+    left_out: tuple[LeftOutMarker, ...],
+    track: PoseTrack | None,
+    terms: PacketTerms,
+    signals: SignalPicture | None,
+    camera: PosedCamera | None,
+) -> LaneResult:
+    """Estimate a lane through verified markers, simulate a drive along it, and draw it."""
+    from app.lanes.estimate import fit_lane
+
+    began = time.perf_counter()
+    lane = fit_lane(markers, track, method=terms.method, rules=terms.lane)
+    steering = _check_steering(lane, terms.controller)
+    overlay = _overlay(lane, markers, camera)
+    decode_ms = 1e3 * (time.perf_counter() - began)
+    return LaneResult(lane, steering, overlay, _plot(lane, markers, left_out, track, signals).encode(), decode_ms)
+
+
+def _check_steering(lane: Lane, controller: Controller | None) -> SteeringCheck | str | None:
+    if controller is None or len(lane.station_m) < 2:
+        return None
+    from app.simulation.steering import check_steering
+
+    limit = lane.speed_limit_km_h
+    speed = np.where(np.isfinite(limit), limit, np.nanmin(limit) if np.isfinite(limit).any() else _DEFAULT_SPEED_KM_H)
+    try:
+        return check_steering(lane.position_enu_m, speed, controller=controller)
+    except InvalidParameter as error:
+        return error.message
+
+
+def _overlay(lane: Lane, markers: LaneMarkers, camera: PosedCamera | None) -> LaneOverlay | None:
+    if camera is None or len(lane.station_m) < 2:
+        return None
+    origin = (lane.origin_lon_deg, lane.origin_lat_deg)
+    lon_deg, lat_deg, heading_deg = camera.pose
+    east, north = plane_from_wgs84(np.array([lon_deg]), np.array([lat_deg]), origin)[0]
+    points = plane_from_wgs84(markers.lon_deg, markers.lat_deg, origin)
+    return lane_in_frame(
+        ned_from_enu(lane.left_enu_m),
+        ned_from_enu(lane.right_enu_m),
+        ned_from_enu(lane.position_enu_m),
+        pose=VehiclePose((float(north), float(east), 0.0), heading_deg),
+        camera=camera.camera,
+        markers_ned_m=ned_from_enu(points[lane.side > 0]),
+    )
+
+
+def _plot(
+    lane: Lane,
+    markers: LaneMarkers,
+    left_out: tuple[LeftOutMarker, ...],
+    track: PoseTrack | None,
+    signals: SignalPicture | None,
+) -> str:
+    picture = picture_of_lane(lane, markers, track)
+    if left_out:
+        origin = (lane.origin_lon_deg, lane.origin_lat_deg)
+        numbers, lon_deg, lat_deg, reasons = zip(*left_out, strict=True)
+        first = len(picture.marker_number)
+        picture = replace(
+            picture,
+            marker_m=np.vstack([picture.marker_m, plane_from_wgs84(np.array(lon_deg), np.array(lat_deg), origin)]),
+            marker_number=np.append(picture.marker_number, numbers),
+            marker_side=np.append(picture.marker_side, np.zeros(len(numbers), int)),
+            left_out={**picture.left_out, **{first + k: reason for k, reason in enumerate(reasons)}},
+        )
+    return plot_lane(picture, signals)
+
+
+@decoder_task("frame", "send the frame at the camera's resolution", is_long=False)
+def draw_overlay(file: SpooledFile, frame: str, overlay: LaneOverlay, suffix: str, images: ImageLimits) -> bytes:
+    """Draw a lane over the camera frame of this name in an upload, and encode it as ``png`` or ``jpg``."""
+    with file.open() as stream:
+        parts = open_parts({frame: stream}, TraceLimits())
+        data = next(part.content() for part in parts if part.name == frame)
+    return encode_picture(draw_lane(load_image(data, images).pixels, overlay), suffix)
