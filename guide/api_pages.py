@@ -236,7 +236,7 @@ def _responses_text(responses: dict[str, Any], link: LinkTo) -> str:
     rows, problems = [], []
     for status, response in sorted(responses.items()):
         content = response.get("content", {})
-        if "application/problem+json" in content:
+        if "$ref" in response or "application/problem+json" in content:
             problems.append(status)
             continue
         kinds = "; ".join(f"{code(kind)} {type_text(each.get('schema', {}), link)}" for kind, each in content.items())

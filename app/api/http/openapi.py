@@ -7,6 +7,7 @@ a test compares it with the app's own document, which does not depend on setting
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from fastapi.routing import APIRoute
 
 from app.api.http.middleware import is_protected
 from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
-from app.api.http.problems import component_schemas
+from app.api.http.problems import MEDIA_TYPE, component_schemas
 
+_RESPONSES = "#/components/responses/"
 STORED = Path(__file__).with_name("data") / "openapi.json"
 DESCRIPTION = """The registry of machine-readable roads: coded plates, magnet tags, radio markers (CERPMs) and fiducial
 signs, from the plan of a road to artwork and surveys, and to the decoded uploads and drives of vehicles.
@@ -78,6 +80,7 @@ def describe(app: FastAPI) -> None:
             schemas = components.get("schemas", {}) | component_schemas()
             components["schemas"] = dict(sorted(schemas.items()))  # else in the order of the first requests
             components["securitySchemes"] = SECURITY_SCHEMES
+            components["responses"] = _share_problems(document)
             _require_keys(document)
             _describe_headers(document)
             app.openapi_schema = document
@@ -92,6 +95,28 @@ def stored_text(document: dict[str, Any]) -> str:
 
 
 _LICENSE = {"name": "Apache-2.0", "identifier": "Apache-2.0"}
+
+
+def _share_problems(document: dict[str, Any]) -> dict[str, Any]:
+    """Move the problem responses that several operations have out of them; they refer to them by name.
+
+    The name is `Problem` and the status; `ProblemOrPage` where browsers get a page instead.
+    """
+    problems = [
+        (operation["responses"], status, response)
+        for operations in document["paths"].values()
+        for operation in operations.values()
+        for status, response in operation["responses"].items()
+        if MEDIA_TYPE in response.get("content", {})
+    ]
+    uses = Counter(json.dumps(response) for _, _, response in problems)
+    shared = {}
+    for responses, status, response in problems:
+        if uses[json.dumps(response)] > 1:
+            name = f"{'ProblemOrPage' if 'text/html' in response['content'] else 'Problem'}{status}"
+            shared[name] = response
+            responses[status] = {"$ref": f"{_RESPONSES}{name}"}
+    return dict(sorted(shared.items()))
 
 
 def _require_keys(document: dict[str, Any]) -> None:

@@ -224,7 +224,10 @@ def test_every_protected_operation_documents_keys_and_problems(document: dict[st
     for name, operation in protected:
         assert operation["security"] == [{"bearer": []}, {"apiKey": []}, {"basic": []}], name
         for status in ("400", "401", "403", "413", "422", "500", "503"):
-            assert MEDIA_TYPE in operation["responses"][status]["content"], (name, status)
+            response = operation["responses"][status]
+            if "$ref" in response:
+                response = document["components"]["responses"][response["$ref"].rpartition("/")[2]]
+            assert MEDIA_TYPE in response["content"], (name, status)
         assert operation["summary"], name
 
 
