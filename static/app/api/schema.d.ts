@@ -3038,7 +3038,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             dev_eui: string | null;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "cerpm";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -3943,7 +3947,11 @@ export interface components {
             code: components["schemas"]["FiducialCodeDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "fiducial";
             geometry: components["schemas"]["FiducialGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -4000,7 +4008,11 @@ export interface components {
             contrast: number;
             corners_px: number[][];
             digits: string | null;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "fiducial";
             fix: components["schemas"]["FixDocument"] | null;
             frame: number;
             match: components["schemas"]["MatchDocument"] | null;
@@ -4066,7 +4078,11 @@ export interface components {
             created_at: string;
             dev_eui: string | null;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "cerpm";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4091,7 +4107,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "fiducial";
             geometry: components["schemas"]["FiducialGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -4113,7 +4133,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "magnet";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4135,7 +4159,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "plate";
             geometry: components["schemas"]["PlateGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -4587,7 +4615,11 @@ export interface components {
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "magnet";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4613,7 +4645,11 @@ export interface components {
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "magnet";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -5271,7 +5307,11 @@ export interface components {
             code: components["schemas"]["PlateCodeDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "plate";
             geometry: components["schemas"]["PlateGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -5350,7 +5390,11 @@ export interface components {
             digits: string | null;
             doubtful_cells: number[];
             evidence_frames: number[];
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "plate";
             fix: components["schemas"]["FixDocument"] | null;
             frame: number;
             from_codebook: boolean;
