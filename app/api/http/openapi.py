@@ -30,36 +30,35 @@ latitude in degrees; headings are clockwise from true north.
 """
 
 _TAGS = {
-    "markers": "Markers of every family: surveyed positions, states, history, bulk writes and searches.",
-    "artwork": "Printable plates and signs, with proofs of what a camera reads.",
-    "layouts": "Magnet tags: holes to drill for a meaning.",
-    "cerpms": "Radio markers: keys, frames, and how far they are heard.",
-    "codebooks": "Meanings of magnet tags.",
-    "roads": "Road axes, stations along them, and the markers beside them.",
-    "plans": "Plans of a road: alignments, rules, placement, proofs, files for crews, and commits.",
-    "imports": "Surveys and tables that become markers.",
-    "exports": "Markers as files.",
-    "uploads": "Files that vehicles send: in one request, resumed, or in parts of an S3 store.",
-    "decodes": "What was read in photos, videos, traces and packet logs, against the registry.",
-    "drives": "Several decodes of one vehicle as one track.",
-    "maintenance": "Markers that vehicles found missing, moved, cloned, reversed or fading; people decide.",
-    "public pages": "Pages of markers that need no key, what agencies release on them, and damage reports.",
-    "jobs": "Work that goes on after the answer: state, progress, cancellation.",
-    "events": "What happened, as it happens.",
-    "webhooks": "Signed messages to your server when jobs end and markers become suspect.",
-    "reprocessing": "New versions of the decoders over stored uploads, and what they change.",
-    "fleet": "Vehicles, cameras and their calibrations.",
-    "snapshots": "Files of the registry for vehicles that decode offline.",
-    "audit": "The log of all changes, chained by hashes.",
     "access": (
         "Keys and agencies. An admin of an agency manages its keys at `/v1/keys`. The server's operator creates an"
         " agency and its first admin key with `POST /v1/agencies`, using a key that `waymark key --operator` printed on"
         " the server's machine."
     ),
+    "roads": "Road axes, stations along them, and the markers beside them.",
+    "imports": "Surveys and tables that become markers.",
+    "markers": "Markers of every family: surveyed positions, states, history, bulk writes and searches.",
+    "codebooks": "Meanings of magnet tags.",
+    "artwork": "Printable plates and signs with proofs of what a camera reads, and drilling sheets of magnet tags.",
+    "cerpms": "Radio markers: keys, frames, and how far they are heard.",
+    "plans": "Plans of a road: alignments, rules, placement, proofs, files for crews, and commits.",
+    "fleet": "Vehicles, cameras and their calibrations.",
+    "uploads": "Files that vehicles send: in one request, resumed, or in parts of an S3 store.",
+    "decodes": "What was read in photos, videos, traces and packet logs, against the registry.",
+    "drives": "Several decodes of one vehicle as one track.",
+    "marker health": "Markers that vehicles found missing, moved, cloned, reversed or fading; people decide.",
+    "public pages": "Pages of markers that need no key, what agencies release on them, and damage reports.",
+    "reprocessing": "New versions of the decoders over stored uploads, and what they change.",
+    "snapshots": "Files of the registry for vehicles that decode offline.",
+    "exports": "Markers as files.",
     "ogc": "OGC API Features and Tiles, for GIS clients.",
+    "jobs": "Work that goes on after the answer: state, progress, cancellation.",
+    "events": "What happened, as it happens.",
+    "webhooks": "Signed messages to your server when jobs end and markers become suspect.",
+    "audit": "The log of all changes, chained by hashes.",
     "system": "Health of the server, and what it runs.",
 }
-"""The parts of the API in the order in which /docs shows them."""
+"""The parts of the API in the order of a user's work, in which /docs shows them."""
 
 
 def operation_id(route: APIRoute) -> str:

@@ -117,13 +117,19 @@ Body = Annotated[dict[str, Any], Depends(get_body)]
 
 @router.options("", responses=problem_responses(404))
 async def list_collection_methods(request: Request, collection: CollectionOf, caller: Caller) -> Response:
-    """The methods that the caller may use on a collection's features, as the header Allow."""
+    """List the methods that the caller may use on a collection.
+
+    They are in the header Allow.
+    """
     return _allowed(request, collection, caller, "POST")
 
 
 @router.options("/{feature}", responses=problem_responses(404))
 async def list_feature_methods(request: Request, collection: CollectionOf, caller: Caller, feature: str) -> Response:
-    """The methods that the caller may use on a feature, as the header Allow."""
+    """List the methods that the caller may use on a feature.
+
+    They are in the header Allow.
+    """
     return _allowed(request, collection, caller, "PUT", "PATCH", "DELETE")
 
 
@@ -137,7 +143,10 @@ def _allowed(request: Request, collection: Collection, caller: CallerValue, *edi
 
 @router.post("", status_code=201, responses=problem_responses(404, 409), openapi_extra=_WITH_BODY)
 def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
-    """Register a marker of a family whose markers are points."""
+    """Register a marker as a feature.
+
+    Of a family whose markers are points.
+    """
     given = {name: value for name, value in _properties(feature).items() if value is not None}
     body = {name: given[name] for name in _PLAIN if name in given}
     surveyed = {name: given[name] for name in _SURVEYED if name in given}
@@ -152,7 +161,10 @@ def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
 
 @router.put("/{feature}", status_code=204, responses=problem_responses(404, 409, 412), openapi_extra=_WITH_BODY)
 def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
-    """Replace a marker: what is left out is cleared, but for what a marker always has."""
+    """Replace a marker by a feature.
+
+    What is left out is cleared, but for what a marker always has.
+    """
     stored = edit.features.get(edit.caller, edit.collection, feature_id)
     given = {**dict.fromkeys((*_CLEARED, *_SURVEYED)), **_properties(feature)}
     place = _place(feature.get("geometry"), edit.crs)

@@ -43,7 +43,10 @@ _FILTERS = [name for name in PARAMETERS if name not in (*OF_ITEMS, *OF_TILE)]
 def list_items(
     collection: CollectionOf, query: ItemsQueryOf, base: BaseUrl, caller: Caller, features: FeaturesService
 ) -> Response:
-    """A page of features, or how many there are."""
+    """List the features of a collection.
+
+    A page of them, or with `resultType=hits` how many there are.
+    """
     count, read = features.count, features.page
     if collection.lines is not None:
         count = partial(features.count_lines, lines=collection.lines)
@@ -80,7 +83,7 @@ def get_item(
     caller: Caller,
     features: FeaturesService,
 ) -> Response:
-    """One feature."""
+    """Get a feature."""
     if collection.lines is not None:
         feature = features.get_line(caller, collection, collection.lines, feature_id, query.crs)
     else:

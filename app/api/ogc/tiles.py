@@ -283,7 +283,10 @@ def get_tile(
     caller: Caller,
     features: FeaturesService,
 ) -> Response:
-    """A tile; 204 without features."""
+    """Get a vector tile of a collection.
+
+    204 without features.
+    """
     content = (features.grouped_tile if groups else features.tile)(caller, collection, tile)
     headers = {"Cache-Control": "private, no-cache"}
     if not content:
@@ -293,13 +296,16 @@ def get_tile(
 
 @router.get("/collections/{collection}/tiles", **describe_read(TileSets, html=False))
 def list_tilesets(collection: Tiled, _offers: OffersJson, base: BaseUrl) -> Response:
-    """The tile sets of a collection: one."""
+    """List the tile sets of a collection.
+
+    There is one.
+    """
     return answer(TileSets(tilesets=[_tileset(base, collection)]))
 
 
 @router.get("/collections/{collection}/tiles/{matrix_set}", **describe_read(TileSet, html=False))
 def get_tileset(collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl) -> Response:
-    """A tile set of a collection."""
+    """Get a tile set of a collection."""
     return answer(_tileset(base, collection))
 
 
@@ -308,7 +314,7 @@ def get_tilejson(
     collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl, caller: Caller,
     features: FeaturesService,
 ) -> Response:  # fmt: skip
-    """A tile set of a collection as TileJSON 3.0."""
+    """Get a tile set of a collection as TileJSON 3.0."""
     return answer(tilejson(collection, _template(base, collection), features.extent(caller, collection)))
 
 
@@ -317,7 +323,10 @@ def get_map_style(
     collection: Tiled, _matrix_set: MatrixSet, _offers: OffersStyle, base: BaseUrl, caller: Caller,
     features: FeaturesService,
 ) -> Response:  # fmt: skip
-    """A MapLibre style of a tile set: symbols by family and status."""
+    """Get a MapLibre style of a tile set.
+
+    It has symbols by family and status.
+    """
     sprite_url = f"{base.removesuffix('/ogc')}/static/sprites/markers"
     extent = features.extent(caller, collection)
     return answer(map_style(collection, _template(base, collection), sprite_url, extent), MAP_STYLE)
@@ -325,14 +334,17 @@ def get_map_style(
 
 @router.get("/tileMatrixSets", **describe_read(TileMatrixSets, html=False))
 def list_matrix_sets(_offers: OffersJson, base: BaseUrl) -> Response:
-    """The tile matrix sets: one."""
+    """List the tile matrix sets.
+
+    There is one.
+    """
     links = [link(f"{base}/tileMatrixSets/{MATRIX_SET}", "self", JSON)]
     return answer(TileMatrixSets(tileMatrixSets=[{"id": MATRIX_SET, "uri": MATRIX_SET_URI, "links": links}]))
 
 
 @router.get("/tileMatrixSets/{matrix_set}", **describe_read(TileMatrixSet, html=False))
 def get_matrix_set(_matrix_set: MatrixSet, _offers: OffersJson) -> Response:
-    """The tile matrix set, by its figures."""
+    """Get a tile matrix set."""
     matrices: list[TileMatrix] = [
         {
             "id": str(zoom),

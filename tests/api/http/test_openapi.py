@@ -48,6 +48,16 @@ def test_every_operation_belongs_to_a_part_that_is_described(server: LiveServer)
     assert all(tag["description"].endswith(".") for tag in document["tags"])
 
 
+def test_every_operation_has_a_summary_that_somebody_wrote(server: LiveServer) -> None:
+    for path, operations in server.app.openapi()["paths"].items():
+        for method, operation in operations.items():
+            summary = operation["summary"]
+            assert 8 < len(summary) <= 70, (method, path, summary)
+            assert summary != operation["operationId"].replace("_", " ").title(), (method, path)
+            assert summary[0].isupper(), (method, path)
+            assert not summary.endswith("."), (method, path)
+
+
 def test_problems_that_operations_share_are_described_once(server: LiveServer) -> None:
     document = server.app.openapi()
     read = document["paths"]["/v1/markers/{marker_id}"]["get"]["responses"]
