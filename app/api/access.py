@@ -59,10 +59,7 @@ def list_audit_entries(
     log: Annotated[AuditLog, use_cases("audit")],
     wanted: Annotated[EntryFilter, Depends(get_entry_filter)],
     limit: PageSize = 100,
-    after: Annotated[int, Query(ge=0, lt=2**53, description="Last number of the page before.")] = 0,
-    before: Annotated[
-        int | None, Query(ge=1, lt=2**53, description="Last number of the page before, where the newest come first.")
-    ] = None,
+    after: Annotated[int | None, Query(ge=0, lt=2**53, description="Last number of the page before.")] = None,
     order: Annotated[Literal["oldest", "newest"], Query(description="Which entries come first.")] = "oldest",
 ) -> Response:
     """List the entries of the audit log.
@@ -70,10 +67,10 @@ def list_audit_entries(
     Oldest first or newest first. `waymark audit verify` computes its hashes again.
     """
     if order == "oldest":
-        page, last = log.page(caller, after=after, limit=limit, wanted=wanted)
-        return page_response(request, page, after=last)
-    page, last = log.page(caller, before=before or _NEWEST, limit=limit, wanted=wanted)
-    return page_response(request, page, before=last)
+        page, last = log.page(caller, after=after or 0, limit=limit, wanted=wanted)
+    else:
+        page, last = log.page(caller, before=_NEWEST if after is None else after, limit=limit, wanted=wanted)
+    return page_response(request, page, after=last)
 
 
 @audit_router.post(

@@ -151,14 +151,14 @@ def list_drives(
     vehicle: Annotated[Identifier | None, Query(description="Id of the vehicle that drove.")] = None,
     state: JobState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List the drives of an agency.
 
     Without their reports, newest first. Vehicles see their own.
     """
-    page, last = drives.page(caller, vehicle=vehicle, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    page, last = drives.page(caller, vehicle=vehicle, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @router.get("/{drive_id}", responses=document_response(TrackedDriveDocument, 404))

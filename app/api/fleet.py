@@ -197,14 +197,14 @@ def list_calibrations(
     caller: Caller,
     calibrations: CalibrationService,
     limit: Annotated[int, Query(ge=1, le=100)] = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List the calibrations of an agency.
 
     Newest first.
     """
-    page, last = calibrations.page(caller, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    page, last = calibrations.page(caller, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @calibration_router.get("/calibrations/{calibration_id}", responses=document_response(CalibrationDocument, 404))

@@ -243,14 +243,14 @@ def list_jobs(
         bool | None, Query(description="`true`: only jobs that stopped the processes that worked on them.")
     ] = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List the jobs of an agency.
 
     Of all kinds that the key may see, newest first.
     """
-    page, last = jobs.page(caller, kind=kind, state=state, dead_letter=dead_letter, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    page, last = jobs.page(caller, kind=kind, state=state, dead_letter=dead_letter, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @router.get("/{job_id}", responses=document_response(JobDocument, 404))
@@ -518,14 +518,14 @@ def list_deliveries(
     webhooks: WebhookService,
     state: DeliveryState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List the deliveries of a webhook.
 
     What was sent and how that ended, newest first; kept for 30 days.
     """
-    page, last = webhooks.deliveries(caller, webhook_id, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    page, last = webhooks.deliveries(caller, webhook_id, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @webhook_router.post(

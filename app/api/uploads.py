@@ -350,8 +350,8 @@ async def post_upload(response: Annotated[Response, Depends(_created)]) -> Respo
 
     By tus 1.0 (creation, creation-with-upload), or by JSON one whose parts go to S3 directly.
 
-    Upload-Length is the size of the whole file. Upload-Metadata may have `filename`, `context` (the JSON of `Waymark-
-    Context`) and `vehicle`. What is refused later, e.g. a file of no known kind, is refused by its last part.
+    Upload-Length is the size of the whole file. Upload-Metadata may have `filename`, `context` (the JSON of
+    `Waymark-Context`) and `vehicle`. What is refused later, e.g. a file of no known kind, is refused by its last part.
     """
     return response
 

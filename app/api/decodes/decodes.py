@@ -95,15 +95,15 @@ def list_decodes(
     since: Annotated[Time | None, Query(description="Uploaded then or later.")] = None,
     until: Annotated[Time | None, Query(description="Uploaded before then.")] = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List the decodes of an agency.
 
     Without their results, newest first.
     """
     wanted = DecodeFilter(state=state, kind=kind, vehicle=vehicle, since=since, until=until)
-    page, last = decodes.page(caller, wanted, before=before, limit=limit)
-    return page_response(request, {"items": page}, before=last)
+    page, last = decodes.page(caller, wanted, before=after, limit=limit)
+    return page_response(request, {"items": page}, after=last)
 
 
 @router.get("/{decode_id}", responses=document_response(DecodeDocument, 404))
@@ -155,12 +155,12 @@ def get_lane(decode_id: DecodeId, caller: Caller, outputs: Outputs) -> Response:
 
 
 @router.get(
-    "/{decode_id}/overlay.{suffix}",
+    "/{decode_id}/overlay.{form}",
     responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_overlay(
     decode_id: DecodeId,
-    suffix: Literal["png", "jpg"],
+    form: Literal["png", "jpg"],
     caller: Caller,
     decodes: Decodes,
     outputs: Outputs,
@@ -170,20 +170,20 @@ def get_overlay(
 
     It is drawn when it is asked for.
     """
-    headers = {"ETag": f'"{decode_id}-overlay-{suffix}"', "Cache-Control": "private, no-cache"}
+    headers = {"ETag": f'"{decode_id}-overlay-{form}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         decodes.get(caller, decode_id)
         return Response(status_code=304, headers=headers)
-    return Response(outputs.overlay(caller, decode_id, suffix), headers=headers, media_type=_MEDIA_TYPES[suffix])
+    return Response(outputs.overlay(caller, decode_id, form), headers=headers, media_type=_MEDIA_TYPES[form])
 
 
 @router.get(
-    "/{decode_id}/annotated.{suffix}",
+    "/{decode_id}/annotated.{form}",
     responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_annotated(
     decode_id: DecodeId,
-    suffix: Literal["png", "jpg"],
+    form: Literal["png", "jpg"],
     caller: Caller,
     decodes: Decodes,
     outputs: Outputs,
@@ -197,13 +197,13 @@ def get_annotated(
 
     Of a video, only frames in which something was found.
     """
-    form = suffix if outlines else f"{suffix}-plain"
-    headers = {"ETag": f'"{decode_id}-{frame}-{form}"', "Cache-Control": "private, no-cache"}
+    shown = form if outlines else f"{form}-plain"
+    headers = {"ETag": f'"{decode_id}-{frame}-{shown}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         decodes.get(caller, decode_id)
         return Response(status_code=304, headers=headers)
-    picture = outputs.annotated(caller, decode_id, suffix, frame, outlined=outlines)
-    return Response(picture, headers=headers, media_type=_MEDIA_TYPES[suffix])
+    picture = outputs.annotated(caller, decode_id, form, frame, outlined=outlines)
+    return Response(picture, headers=headers, media_type=_MEDIA_TYPES[form])
 
 
 # === /v1/decodes/{decode_id}: samples, packets, the vehicle's track and lists of readings of one decode.

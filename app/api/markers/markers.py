@@ -267,14 +267,14 @@ def list_marker_observations(
     since: Time | None = None,
     until: Time | None = None,
     limit: PageSize = 100,
-    before: Annotated[Text | None, Query(max_length=120, description="As the link to the next page has it.")] = None,
+    after: Annotated[Text | None, Query(max_length=120, description="As the link to the next page has it.")] = None,
 ) -> Response:
     """List the observations of a marker.
 
     What decodes saw of it, newest first.
 
-    `what` is `seen`, `missed`, `ambiguous`, `out-of-place`, `out-of-reach`, `moved`, `cloned`, `wrong-way` or `off-
-    line`.
+    `what` is `seen`, `missed`, `ambiguous`, `out-of-place`, `out-of-reach`, `moved`, `cloned`, `wrong-way` or
+    `off-line`.
     """
     page, last = observations.page(
         caller,
@@ -282,10 +282,10 @@ def list_marker_observations(
         what=what,
         since=since,
         until=until,
-        before=place_of(before) if before is not None else None,
+        before=place_of(after) if after is not None else None,
         limit=limit,
     )
-    return page_response(request, page, before=last)
+    return page_response(request, page, after=last)
 
 
 @observation_router.get("/summary", responses=document_response(ObservationSummary, 404))

@@ -133,14 +133,14 @@ def list_plan_jobs(
     plan_id: Annotated[Identifier | None, Query(description="Jobs about this plan.")] = None,
     state: JobState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List jobs about plans.
 
     Without their results, newest first.
     """
-    page, last = jobs.page(caller, plan_id=plan_id, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    page, last = jobs.page(caller, plan_id=plan_id, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @job_router.get("/{job_id}", responses=document_response(PlanJobDocument, 404))

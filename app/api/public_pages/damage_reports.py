@@ -62,14 +62,14 @@ def list_damage_reports(
     status: Annotated[ReportStatus | None, Query(description="Of the reports; without it, all.")] = None,
     marker_id: Annotated[Identifier | None, Query(description="Id of a marker.")] = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List the damage reports of an agency.
 
     Newest first.
     """
-    page, last = reports.page(caller, state=status, marker_id=marker_id, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    page, last = reports.page(caller, state=status, marker_id=marker_id, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @router.get("/{report_id}", responses=document_response(DamageReport, 404))

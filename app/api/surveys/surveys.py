@@ -148,14 +148,14 @@ def list_imports(
     jobs: Jobs,
     state: JobState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
     """List the imports of an agency that are or were jobs.
 
     Without their reports, newest first. Those that were answered at once are none.
     """
-    page, last = jobs.page(caller, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    page, last = jobs.page(caller, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @import_router.get("/{import_id}", responses=document_response(ImportJobDocument, 404))

@@ -472,7 +472,7 @@ def place_of(cursor: str) -> Place:
 def _bad_cursor() -> InvalidParameter:
     return InvalidParameter(
         "this is not where a page of observations ended",
-        field="before",
+        field="after",
         limit="as the link to the next page has it",
-        cure="start without before, and follow the links",
+        cure="start without after, and follow the links",
     )

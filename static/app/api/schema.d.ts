@@ -868,7 +868,7 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/decodes/{decode_id}/annotated.{suffix}": {
+    "/v1/decodes/{decode_id}/annotated.{form}": {
         parameters: {
             query?: never;
             header?: never;
@@ -919,7 +919,7 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/decodes/{decode_id}/overlay.{suffix}": {
+    "/v1/decodes/{decode_id}/overlay.{form}": {
         parameters: {
             query?: never;
             header?: never;
@@ -7943,8 +7943,7 @@ export interface operations {
         parameters: {
             query?: {
                 action?: string | null;
-                after?: number;
-                before?: number | null;
+                after?: number | null;
                 limit?: number;
                 order?: "oldest" | "newest";
                 since?: string | null;
@@ -8051,7 +8050,7 @@ export interface operations {
     list_calibrations: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
             };
             header?: never;
@@ -8304,7 +8303,7 @@ export interface operations {
     list_damage_reports: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 marker_id?: string | null;
                 status?: ("new" | "accepted" | "rejected") | null;
@@ -8485,7 +8484,7 @@ export interface operations {
     list_decodes: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 kind?: components["schemas"]["DecodeKind"] | null;
                 limit?: number;
                 since?: string | null;
@@ -8593,7 +8592,7 @@ export interface operations {
             };
             path: {
                 decode_id: string;
-                suffix: "png" | "jpg";
+                form: "png" | "jpg";
             };
             cookie?: never;
         };
@@ -8677,7 +8676,7 @@ export interface operations {
             };
             path: {
                 decode_id: string;
-                suffix: "png" | "jpg";
+                form: "png" | "jpg";
             };
             cookie?: never;
         };
@@ -8870,7 +8869,7 @@ export interface operations {
     list_drives: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
                 vehicle?: string | null;
@@ -9152,7 +9151,7 @@ export interface operations {
     list_imports: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
             };
@@ -9269,7 +9268,7 @@ export interface operations {
     list_jobs: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 dead_letter?: boolean | null;
                 kind?: components["schemas"]["JobKind"] | null;
                 limit?: number;
@@ -9926,7 +9925,7 @@ export interface operations {
     list_marker_observations: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 since?: string | null;
                 until?: string | null;
@@ -10144,7 +10143,7 @@ export interface operations {
     list_plan_jobs: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 plan_id?: string | null;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
@@ -11867,7 +11866,7 @@ export interface operations {
     list_deliveries: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 state?: ("waiting" | "delivered" | "failed") | null;
             };
