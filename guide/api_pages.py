@@ -185,7 +185,8 @@ def _operation_section(operation: Operation, link: LinkTo) -> str:
     return "".join(
         (
             f"## {code(operation.route)}\n\n",
-            f"{described.get('description') or described.get('summary', '')}\n\n".strip() + "\n\n",
+            f"{described['summary']}.\n\n",
+            f"{described['description']}\n\n" if described.get("description") else "",
             f"Key: {_scopes_text(operation)}\n\n",
             _titled("Parameters", _parameters_table(described.get("parameters", []), link)),
             _body_text(described.get("requestBody"), link),
@@ -236,7 +237,7 @@ def _responses_text(responses: dict[str, Any], link: LinkTo) -> str:
     rows, problems = [], []
     for status, response in sorted(responses.items()):
         content = response.get("content", {})
-        if "application/problem+json" in content:
+        if "$ref" in response or "application/problem+json" in content:
             problems.append(status)
             continue
         kinds = "; ".join(f"{code(kind)} {type_text(each.get('schema', {}), link)}" for kind, each in content.items())

@@ -89,6 +89,8 @@ class _Document:
         response = operation["responses"].get(str(status))
         if response is None:
             return [f"the status is not one of {', '.join(operation['responses'])}"]
+        if "$ref" in response:  # a problem that many operations share
+            response = self._components["responses"][response["$ref"].rpartition("/")[2]]
         content = response.get("content", {})
         if not content:
             return [f"no content is documented: {body[:80]!r}"] if body else []

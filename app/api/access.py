@@ -59,18 +59,18 @@ def list_audit_entries(
     log: Annotated[AuditLog, use_case(lambda cases: cases.audit)],
     wanted: Annotated[EntryFilter, Depends(get_entry_filter)],
     limit: PageSize = 100,
-    after: Annotated[int, Query(ge=0, lt=2**53, description="Last number of the page before.")] = 0,
-    before: Annotated[
-        int | None, Query(ge=1, lt=2**53, description="Last number of the page before, where the newest come first.")
-    ] = None,
+    after: Annotated[int | None, Query(ge=0, lt=2**53, description="Last number of the page before.")] = None,
     order: Annotated[Literal["oldest", "newest"], Query(description="Which entries come first.")] = "oldest",
 ) -> Response:
-    """The agency's log, oldest first or newest first. `waymark audit verify` computes its hashes again."""
+    """List the entries of the audit log.
+
+    Oldest first or newest first. `waymark audit verify` computes its hashes again.
+    """
     if order == "oldest":
-        page, last = log.page(caller, after=after, limit=limit, wanted=wanted)
-        return page_response(request, page, after=last)
-    page, last = log.page(caller, before=before or _NEWEST, limit=limit, wanted=wanted)
-    return page_response(request, page, before=last)
+        page, last = log.page(caller, after=after or 0, limit=limit, wanted=wanted)
+    else:
+        page, last = log.page(caller, before=_NEWEST if after is None else after, limit=limit, wanted=wanted)
+    return page_response(request, page, after=last)
 
 
 @audit_router.post(
@@ -86,7 +86,10 @@ def post_verification(
     verifications: Annotated[AuditVerifications, use_case(lambda cases: cases.audit_verifications)],
     idempotency: Idempotency,
 ) -> Response:
-    """Compute every hash of the agency's log and of its markers' versions again, as a job."""
+    """Verify the audit log.
+
+    Computes every hash of the agency's log and of its markers' versions again, as a job.
+    """
     document, replayed = verifications.request(caller, wanted, idempotency)
     response = created_response(document, replayed, path="/v1/audit/verifications", status=202)
     response.headers["Retry-After"] = "1"
@@ -99,7 +102,10 @@ def get_verification(
     caller: Caller,
     verifications: Annotated[AuditVerifications, use_case(lambda cases: cases.audit_verifications)],
 ) -> Response:
-    """A verification with its progress, and what it found once it is done."""
+    """Get a verification of the audit log.
+
+    With its progress, and what it found once it is done.
+    """
     document = verifications.get(caller, verification_id)
     waiting = document["state"] in ("queued", "running")
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
@@ -159,33 +165,45 @@ Service = Annotated[Keys, use_case(lambda cases: cases.keys)]
 
 @key_router.post("", status_code=201, responses=document_response(NewKeyDocument, status=201))
 def post_key(key: KeyIn, caller: Caller, keys: Service) -> Response:
-    """Make a key. Its text is in this answer only; an Idempotency-Key is not heeded, because no answer is kept."""
+    """Create a key.
+
+    Its text is in this answer only; an Idempotency-Key is not heeded, because no answer is kept.
+    """
     return _shown_once(keys.create(caller, NewKey(key.scope, key.label, key.expires_at)))
 
 
 @key_router.get("", responses=document_response(KeyPage))
 def list_keys(request: Request, caller: Caller, keys: Service, limit: PageSize = 100, after: LastId = None) -> Response:
-    """The agency's keys, oldest first, also those that have ended."""
+    """List the keys of an agency.
+
+    Oldest first, also those that have ended.
+    """
     page, last = keys.page(caller, after=after, limit=limit)
     return page_response(request, page, after=last)
 
 
 @key_router.get("/{key_id}", responses=document_response(KeyDocument, 404))
 def get_key(key_id: KeyId, caller: Caller, keys: Service) -> Response:
-    """One key."""
+    """Get a key."""
     return json_response(keys.get(caller, key_id))
 
 
 @key_router.post("/{key_id}/rotate", status_code=201, responses=document_response(NewKeyDocument, 404, 409, status=201))
 def rotate_key(key_id: KeyId, rotation: RotationIn, caller: Caller, keys: Service) -> Response:
-    """Make a key that takes over from this one, for the same holder; this one stays valid for the overlap."""
+    """Replace a key by a new one.
+
+    For the same holder; the old one stays valid for the overlap.
+    """
     overlap = timedelta(seconds=rotation.overlap_s)
     return _shown_once(keys.rotate(caller, key_id, overlap=overlap, expires_at=rotation.expires_at))
 
 
 @key_router.delete("/{key_id}", status_code=204, responses=problem_responses(404, 409))
 def revoke_key(key_id: KeyId, caller: Caller, keys: Service) -> Response:
-    """End a key now. It stays in the list; the agency's last valid admin key cannot be ended."""
+    """End a key now.
+
+    It stays in the list; the agency's last valid admin key cannot be ended.
+    """
     keys.revoke(caller, key_id)
     return Response(status_code=204)
 
@@ -212,7 +230,7 @@ class MeDocument(TypedDict):
 
 @me_router.get("", responses=document_response(MeDocument))
 def get_me(caller: Caller, access: Annotated[Access, use_case(lambda cases: cases.access)]) -> Response:
-    """The holder of the key or token of this request."""
+    """Get the holder of the key or token of this request."""
     allowed = [route for route, scopes in PERMISSIONS.items() if scopes != PUBLIC and caller.scope in scopes]
     document = MeDocument(
         agency=access.agency_name(caller),
@@ -249,7 +267,9 @@ class AgencyIn(StrictModel):
 
 @agency_router.post("", status_code=201, responses=document_response(NewAgencyDocument, 409, status=201))
 def post_agency(agency: AgencyIn, caller: Caller, agencies: AgenciesService, idempotency: Idempotency) -> Response:
-    """Create an agency with an admin key, as the server's operator.
+    """Create an agency with an admin key.
+
+    As the server's operator.
 
     The key's text is in this response, and in those to repetitions under the same Idempotency-Key. The agency's admin
     creates all further keys with it: `POST /v1/keys`.
@@ -260,6 +280,9 @@ def post_agency(agency: AgencyIn, caller: Caller, agencies: AgenciesService, ide
 
 @agency_router.get("", responses=document_response(AgencyPage))
 def list_agencies(request: Request, agencies: AgenciesService, limit: PageSize = 100, after: LastId = None) -> Response:
-    """The agencies of this server, oldest first, for its operator."""
+    """List the agencies of this server.
+
+    Oldest first, for its operator.
+    """
     page, last = agencies.page(after=after, limit=limit)
     return page_response(request, page, after=last)

@@ -151,16 +151,22 @@ def list_drives(
     vehicle: Annotated[Identifier | None, Query(description="Id of the vehicle that drove.")] = None,
     state: JobState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """Drives without their reports, newest first. Vehicles see their own."""
-    page, last = drives.page(caller, vehicle=vehicle, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    """List the drives of an agency.
+
+    Without their reports, newest first. Vehicles see their own.
+    """
+    page, last = drives.page(caller, vehicle=vehicle, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @router.get("/{drive_id}", responses=document_response(TrackedDriveDocument, 404))
 def get_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
-    """A drive: its progress, or what its track rests on: clocks, markers, gaps, figures."""
+    """Get a drive.
+
+    Its progress, or what its track rests on: clocks, markers, gaps, figures.
+    """
     document = drives.get(caller, drive_id)
     waiting = document["state"] in ("queued", "running")
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
@@ -168,13 +174,19 @@ def get_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
 
 @router.post("/{drive_id}/cancel", responses=document_response(TrackedDriveDocument, 404))
 def cancel_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
-    """Ask a queued or running drive to stop; a finished one stays as it is."""
+    """Cancel a drive.
+
+    A finished one stays as it is.
+    """
     return json_response(drives.cancel(caller, drive_id))
 
 
 @router.delete("/{drive_id}", status_code=204, responses=problem_responses(404, 409), response_class=Response)
 def delete_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
-    """Delete a finished drive with its track; its decodes stay."""
+    """Delete a finished drive with its track.
+
+    Its decodes stay.
+    """
     drives.delete(caller, drive_id)
     return Response(status_code=204)
 
@@ -194,7 +206,10 @@ def get_track(
     drives: Drives,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """The track: positions with covariance, heading and speed."""
+    """Download the track of a drive.
+
+    Positions with covariance, heading and speed.
+    """
     return _file(drives, caller, drive_id, f"track.{form}", if_none_match)
 
 
@@ -202,7 +217,10 @@ def get_track(
     "/{drive_id}/plot.svg", responses={**file_response(["image/svg+xml"]), **NOT_MODIFIED, **problem_responses(404)}
 )
 def get_track_plot(drive_id: DriveId, caller: Caller, drives: Drives, if_none_match: IfNoneMatch = None) -> Response:
-    """The track with its ellipses and markers, and its accuracy over the drive."""
+    """Get the plot of a drive's track.
+
+    With its ellipses and markers, and its accuracy over the drive.
+    """
     return _file(drives, caller, drive_id, "plot.svg", if_none_match)
 
 

@@ -162,7 +162,10 @@ def get_board(
     marker_mm: Annotated[float, Query(allow_inf_nan=False, description="Side of a marker. [mm]")] = 18.0,
     resolution_dpi: Annotated[float, Query(ge=36, le=300, allow_inf_nan=False, description="Of a PNG.")] = 150.0,
 ) -> Response:
-    """A calibration board at true size, with a bar to measure the print by. Print it at 100 %, flat and matt."""
+    """Download a calibration board at true size.
+
+    With a bar to measure the print by. Print it at 100 %, flat and matt.
+    """
     board = CalibrationBoard(columns, rows, square_mm, marker_mm)
     artwork = write_artwork(encode_board(board), form, dpi=resolution_dpi)
     headers = {"Content-Disposition": f'inline; filename="waymark-board-{columns}x{rows}-{square_mm:g}mm.{form}"'}
@@ -176,7 +179,9 @@ def get_board(
     responses=document_response(CalibrationDocument, 409, 415, status=201, description="Calibrated"),
 )
 def post_calibration(caller: Caller, asked: Asked, calibrations: CalibrationService) -> Response:
-    """Calibrate a camera from photos of a board; photos that cannot be used are left out, each with its reason.
+    """Calibrate a camera from photos of a board.
+
+    Photos that cannot be used are left out, each with its reason.
 
     What is not good enough is refused with a named reason. `PUT /v1/vehicles/{id}/calibration` puts the result into a
     vehicle's camera. The photos are not kept.
@@ -193,11 +198,14 @@ def list_calibrations(
     caller: Caller,
     calibrations: CalibrationService,
     limit: Annotated[int, Query(ge=1, le=100)] = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """Calibrations, newest first."""
-    page, last = calibrations.page(caller, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    """List the calibrations of an agency.
+
+    Newest first.
+    """
+    page, last = calibrations.page(caller, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @calibration_router.get("/calibrations/{calibration_id}", responses=document_response(CalibrationDocument, 404))
@@ -206,7 +214,10 @@ def get_calibration(
     caller: Caller,
     calibrations: CalibrationService,
 ) -> Response:
-    """One calibration with what became of each photo."""
+    """Get a calibration.
+
+    With what became of each photo.
+    """
     return json_response(calibrations.get(caller, calibration_id))
 
 
@@ -339,7 +350,10 @@ VehicleService = Annotated[Vehicles, use_case(lambda cases: cases.vehicles)]
     "", status_code=201, responses=document_response(VehicleDocument, 404, 409, status=201, description="Added")
 )
 def post_vehicle(vehicle: VehicleIn, caller: Caller, vehicles: VehicleService, idempotency: Idempotency) -> Response:
-    """Add a vehicle with its sensor profile; uploads that name it inherit the profile."""
+    """Add a vehicle with its sensor profile.
+
+    Uploads that name it inherit the profile.
+    """
     document, replayed = vehicles.add(caller, vehicle.name, vehicle.profile.given(), vehicle.note, idempotency)
     return created_response(document, replayed, path="/v1/vehicles")
 
@@ -353,14 +367,20 @@ def list_vehicles(
     limit: PageSize = 100,
     after: LastId = None,
 ) -> Response:
-    """Vehicles in the order they were added."""
+    """List the vehicles of an agency.
+
+    In the order they were added.
+    """
     page, last = vehicles.page(caller, status=status, after=after, limit=limit)
     return page_response(request, page, after=last)
 
 
 @vehicle_router.get("/{vehicle_id}", responses=document_response(VehicleDocument, 404))
 def get_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleService) -> Response:
-    """One vehicle, with its version as ETag; what it did since (uploads, kilometres) makes no version."""
+    """Get a vehicle.
+
+    With its version as ETag; what it did since (uploads, kilometres) makes no version.
+    """
     return versioned_response(vehicles.get(caller, vehicle_id))
 
 
@@ -368,13 +388,19 @@ def get_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleService)
 def patch_vehicle(
     vehicle_id: VehicleId, patch: VehiclePatch, caller: Caller, vehicles: VehicleService, version: Version
 ) -> Response:
-    """Change a vehicle that is still at the version named by If-Match."""
+    """Change a vehicle.
+
+    One that is still at the version named by If-Match.
+    """
     return versioned_response(vehicles.change(caller, vehicle_id, patch.change(), version))
 
 
 @vehicle_router.delete("/{vehicle_id}", status_code=204, responses=problem_responses(404, 412, 428))
 def delete_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleService, version: Version) -> Response:
-    """Retire a vehicle. Its uploads and its history stay; new uploads are refused."""
+    """Retire a vehicle.
+
+    Its uploads and its history stay; new uploads are refused.
+    """
     vehicles.retire(caller, vehicle_id, version)
     return Response(status_code=204)
 
@@ -388,7 +414,10 @@ def list_vehicle_versions(
     limit: PageSize = 100,
     after: AfterVersion = 0,
 ) -> Response:
-    """The vehicle's history, oldest first: which profile an upload used can be read back."""
+    """List the versions of a vehicle.
+
+    Oldest first: which profile an upload used can be read back.
+    """
     page, last = vehicles.history(caller, vehicle_id, after=after, limit=limit)
     return page_response(request, page, after=last)
 
@@ -397,19 +426,28 @@ def list_vehicle_versions(
 def put_calibration(
     vehicle_id: VehicleId, choice: CalibrationChoice, caller: Caller, vehicles: VehicleService, version: Version
 ) -> Response:
-    """Put the intrinsics and the distortion of a calibration into the vehicle's camera; its mount stays."""
+    """Put a calibration into a vehicle's camera.
+
+    Its intrinsics and distortion; the mount of the camera stays.
+    """
     return versioned_response(vehicles.put_calibration(caller, vehicle_id, choice.calibration_id, version))
 
 
 @vehicle_router.put("/{vehicle_id}/keys/{key_id}", responses=document_response(VehicleDocument, 404, 409))
 def put_vehicle_key(vehicle_id: VehicleId, key_id: KeyId, caller: Caller, vehicles: VehicleService) -> Response:
-    """Let a key speak for the vehicle: what is uploaded with it need not name the vehicle, and may name no other."""
+    """Let a key speak for a vehicle.
+
+    What is uploaded with it need not name the vehicle, and may name no other.
+    """
     return versioned_response(vehicles.link_key(caller, vehicle_id, key_id))
 
 
 @vehicle_router.delete("/{vehicle_id}/keys/{key_id}", status_code=204, responses=problem_responses(404))
 def delete_vehicle_key(vehicle_id: VehicleId, key_id: KeyId, caller: Caller, vehicles: VehicleService) -> Response:
-    """Let a key speak for the vehicle no longer. The key itself stays valid."""
+    """Let a key speak for a vehicle no longer.
+
+    The key itself stays valid.
+    """
     vehicles.unlink_key(caller, vehicle_id, key_id)
     return Response(status_code=204)
 
@@ -430,7 +468,9 @@ def get_snapshot(
         float, Query(gt=0, le=MAX_HOURS, allow_inf_nan=False, description="How long it holds. [h]")
     ] = 24.0,
 ) -> Response:
-    """The markers of an area, signed, for vehicles that decode without a connection; all but the retired ones.
+    """Download a signed snapshot of an area.
+
+    The markers for vehicles that decode without a connection; all but the retired ones.
 
     With the agency's codebooks. Keys of CERPMs are not in it.
     """
@@ -440,5 +480,8 @@ def get_snapshot(
 
 @snapshot_router.get("/trust", responses=document_response(TrustDocument))
 def get_trust(caller: Caller, snapshots: Snapshots) -> Response:
-    """What the agency's snapshots are verified with. The operator installs it in a vehicle over a trusted channel."""
+    """Get the keys that snapshots are verified with.
+
+    The operator installs them in a vehicle over a trusted channel.
+    """
     return json_response(trust_document(snapshots.trust(caller)))

@@ -23,7 +23,7 @@ from app.services.request_work import counted_steps
 # === /v1/maintenance: faults of markers that vehicles show, and the decisions of people on them.
 
 
-router = APIRouter(prefix="/v1", tags=["maintenance"], route_class=StrictRoute)
+router = APIRouter(prefix="/v1", tags=["marker health"], route_class=StrictRoute)
 
 MEDIA_TYPES = {"geojson": "application/geo+json", "csv": "text/csv"}
 ItemId = Annotated[Identifier, Path(description="Id of the item.")]
@@ -87,7 +87,9 @@ def list_maintenance(
     limit: PageSize = 100,
     after: AfterLink = None,
 ) -> Response:
-    """The work list: suspected faults, the most urgent first; decided ones with `status`.
+    """List the work list of suspected faults.
+
+    The most urgent first; decided ones with `status`.
 
     Nothing changes a marker until a person approves it.
     """
@@ -99,7 +101,10 @@ def list_maintenance(
 def get_maintenance_file(
     form: Literal["geojson", "csv"], caller: Caller, maintenance: Maintenance, filtered: Filtered
 ) -> Response:
-    """All items of a filter as GeoJSON or as a table, the most urgent first."""
+    """Download the work list as GeoJSON or as a table.
+
+    All items of a filter, the most urgent first.
+    """
     headers = {"Content-Disposition": f'attachment; filename="maintenance.{form}"'}
     parts = counted_steps(maintenance.stream(caller, form, filtered))
     return StreamingResponse(parts, headers=headers, media_type=MEDIA_TYPES[form])
@@ -107,7 +112,10 @@ def get_maintenance_file(
 
 @router.get("/maintenance/{item_id}", responses=document_response(MaintenanceItem, 404))
 def get_maintenance_item(item_id: ItemId, caller: Caller, maintenance: Maintenance) -> Response:
-    """One item, with the evidence and the links to its pictures."""
+    """Get an item of the work list.
+
+    With the evidence and the links to its pictures.
+    """
     return json_response(maintenance.get(caller, item_id))
 
 
@@ -115,7 +123,9 @@ def get_maintenance_item(item_id: ItemId, caller: Caller, maintenance: Maintenan
 def approve_maintenance_item(
     item_id: ItemId, approval: ApprovalIn, caller: Caller, maintenance: Maintenance, version: SentVersion
 ) -> Response:
-    """Accept an item, and change its marker as chosen: a version in its history and an entry of the audit log.
+    """Accept an item of the work list.
+
+    Its marker is changed as chosen: a version in its history and an entry of the audit log.
 
     If-Match names the version of the marker that the decision is based on; without it, any version is changed.
     """
@@ -126,11 +136,17 @@ def approve_maintenance_item(
 def dismiss_maintenance_item(
     item_id: ItemId, dismissal: DismissalIn, caller: Caller, maintenance: Maintenance
 ) -> Response:
-    """Reject an item with a reason: its test starts anew."""
+    """Reject an item of the work list.
+
+    With a reason. Its test starts anew.
+    """
     return json_response(maintenance.dismiss(caller, item_id, dismissal.note))
 
 
 @router.get("/markers/{marker_id}/health", responses=document_response(HealthDocument, 404))
 def get_marker_health(marker_id: MarkerId, caller: Caller, maintenance: Maintenance) -> Response:
-    """The marker's tests: likelihood ratios of faults, the limit at which one is suspected, and its record."""
+    """Get the health of a marker.
+
+    Its tests: likelihood ratios of faults, the limit at which one is suspected, and its record.
+    """
     return json_response(maintenance.health(caller, marker_id))

@@ -252,16 +252,22 @@ def list_jobs(
         bool | None, Query(description="`true`: only jobs that stopped the processes that worked on them.")
     ] = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """Jobs of all kinds that the key may see, newest first."""
-    page, last = jobs.page(caller, kind=kind, state=state, dead_letter=dead_letter, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    """List the jobs of an agency.
+
+    Of all kinds that the key may see, newest first.
+    """
+    page, last = jobs.page(caller, kind=kind, state=state, dead_letter=dead_letter, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @router.get("/{job_id}", responses=document_response(JobDocument, 404))
 def get_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
-    """A job with its progress; `links.result` leads to its result once it is done."""
+    """Get a job with its progress.
+
+    `links.result` leads to its result once it is done.
+    """
     document = jobs.get(caller, job_id)
     waiting = document["state"] in UNFINISHED
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
@@ -269,7 +275,9 @@ def get_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
 
 @router.post("/{job_id}/cancel", responses=document_response(JobDocument, 404, 409))
 def cancel_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
-    """Ask a queued or running job to stop; a finished one stays as it is.
+    """Cancel a job.
+
+    Asks a queued or running job to stop; a finished one stays as it is.
 
     409 where it is too late: an import that is storing already.
     """
@@ -291,7 +299,9 @@ async def get_job_events(
     streams: SharedStreams,
     last_event_id: LastEventId = None,
 ) -> Response:
-    """The progress of a job as server-sent events, until it ends: `done`, `total`, `rate_per_s` and `progress`.
+    """Follow the progress of a job.
+
+    As server-sent events, until it ends: `done`, `total`, `rate_per_s` and `progress`.
 
     The first event is the present state, and the last one has the name of the state in which the job ended, and the
     whole job as data. With `Last-Event-ID`, what was seen is not sent again. Comments keep the connection open. A
@@ -357,7 +367,10 @@ def get_job_result(
     files: Annotated[JobFiles, use_case(lambda cases: cases.job_files)],
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """The file of a job that writes one: artwork or an export. It is kept for seven days; then 404."""
+    """Download the file of a job.
+
+    Artwork or an export. It is kept for seven days; then 404.
+    """
     file = files.open(caller, job_id)
     headers = {"ETag": f'"{file.sha256}"'}
     if if_none_match == headers["ETag"]:
@@ -399,7 +412,9 @@ async def get_events(
     limit: PageSize = 100,
     last_event_id: LastEventId = None,
 ) -> Response:
-    """What happens in the agency, oldest first: jobs that end, markers that become suspect.
+    """List or follow the events of an agency.
+
+    Oldest first: jobs that end, markers that become suspect.
 
     A vehicle gets the events of the jobs that its key asked for.
 
@@ -465,7 +480,9 @@ class WebhookIn(StrictModel):
 
 @webhook_router.post("", status_code=201, responses=document_response(NewWebhookDocument, 409, status=201))
 def post_webhook(webhook: WebhookIn, caller: Caller, webhooks: WebhookService) -> Response:
-    """Register a URL. Each event is posted to it, signed as Standard Webhooks are, until it answers with 2xx.
+    """Register a webhook.
+
+    Each event is posted to its URL, signed as Standard Webhooks are, until it answers with 2xx.
 
     The secret is in this answer only; an Idempotency-Key is not heeded, because no answer is kept.
     """
@@ -476,26 +493,29 @@ def post_webhook(webhook: WebhookIn, caller: Caller, webhooks: WebhookService) -
 
 @webhook_router.get("", responses=document_response(WebhookList))
 def list_webhooks(caller: Caller, webhooks: WebhookService) -> Response:
-    """The agency's webhooks."""
+    """List the webhooks of an agency."""
     return json_response(webhooks.all(caller))
 
 
 @webhook_router.get("/{webhook_id}", responses=document_response(WebhookDocument, 404))
 def get_webhook(webhook_id: WebhookId, caller: Caller, webhooks: WebhookService) -> Response:
-    """One webhook."""
+    """Get a webhook."""
     return json_response(webhooks.get(caller, webhook_id))
 
 
 @webhook_router.delete("/{webhook_id}", status_code=204, responses=problem_responses(404))
 def delete_webhook(webhook_id: WebhookId, caller: Caller, webhooks: WebhookService) -> Response:
-    """Remove a webhook with its deliveries."""
+    """Delete a webhook with its deliveries."""
     webhooks.delete(caller, webhook_id)
     return Response(status_code=204)
 
 
 @webhook_router.post("/{webhook_id}/enable", responses=document_response(WebhookDocument, 404))
 def enable_webhook(webhook_id: WebhookId, caller: Caller, webhooks: WebhookService) -> Response:
-    """Enable a webhook that was disabled because its receiver failed for a day; it gets the events since then."""
+    """Enable a webhook again.
+
+    One that was disabled because its receiver failed for a day; it gets the events since then.
+    """
     return json_response(webhooks.enable(caller, webhook_id))
 
 
@@ -507,16 +527,22 @@ def list_deliveries(
     webhooks: WebhookService,
     state: DeliveryState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """What was sent to a webhook and how that ended, newest first; kept for 30 days."""
-    page, last = webhooks.deliveries(caller, webhook_id, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    """List the deliveries of a webhook.
+
+    What was sent and how that ended, newest first; kept for 30 days.
+    """
+    page, last = webhooks.deliveries(caller, webhook_id, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @webhook_router.post(
     "/{webhook_id}/deliveries/{delivery_id}/redeliver", responses=document_response(DeliveryDocument, 404, 409)
 )
 def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: Caller, webhooks: WebhookService) -> Response:
-    """Send a delivery again, with the same id and body."""
+    """Send a delivery of a webhook again.
+
+    With the same id and body.
+    """
     return json_response(webhooks.redeliver(caller, webhook_id, delivery_id))

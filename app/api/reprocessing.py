@@ -73,7 +73,9 @@ class ReprocessingIn(StrictModel):
     responses=document_response(ReprocessingDocument, status=202, description="Queued; Location leads to its progress"),
 )
 def post_reprocessing(wanted: ReprocessingIn, caller: Caller, reprocessings: Service) -> Response:
-    """Decode stored uploads again with the present decoders, when no other work waits.
+    """Decode stored uploads again with the present decoders.
+
+    When no other work waits.
 
     The results are kept beside the current ones. Nothing changes until the reprocessing is accepted.
     """
@@ -86,14 +88,20 @@ def post_reprocessing(wanted: ReprocessingIn, caller: Caller, reprocessings: Ser
 def list_reprocessings(
     request: Request, caller: Caller, reprocessings: Service, limit: PageSize = 100, after: LastId = None
 ) -> Response:
-    """The agency's reprocessings, oldest first."""
+    """List the reprocessings of an agency.
+
+    Oldest first.
+    """
     page, last = reprocessings.page(caller, after=after, limit=limit)
     return page_response(request, page, after=last)
 
 
 @router.get("/{reprocessing_id}", responses=document_response(ReprocessingDocument, 404))
 def get_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
-    """A reprocessing with its progress and its sums."""
+    """Get a reprocessing.
+
+    With its progress and its sums.
+    """
     return json_response(reprocessings.get(caller, reprocessing_id))
 
 
@@ -106,7 +114,10 @@ def get_reprocessing_report(
     limit: PageSize = 100,
     after: LastId = None,
 ) -> Response:
-    """Uploads whose readings differ, reading by reading: gained, lost, changed in code, position or confidence."""
+    """Get the report of a reprocessing.
+
+    Uploads whose readings differ, reading by reading: gained, lost, changed in code, position or confidence.
+    """
     page, last = reprocessings.report(caller, reprocessing_id, after=after, limit=limit)
     return page_response(request, page, after=last)
 
@@ -117,7 +128,7 @@ def get_reprocessing_report(
     responses={**file_response(["text/csv"]), **problem_responses(404)},
 )
 def get_reprocessing_csv(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
-    """The report as CSV."""
+    """Download the report of a reprocessing as CSV."""
     headers = {"Content-Disposition": f'attachment; filename="reprocessing-{reprocessing_id}.csv"'}
     lines = reprocessings.report_csv(caller, reprocessing_id)
     return StreamingResponse(lines, headers=headers, media_type="text/csv; charset=utf-8")
@@ -125,13 +136,19 @@ def get_reprocessing_csv(reprocessing_id: ReprocessingId, caller: Caller, reproc
 
 @router.post("/{reprocessing_id}/cancel", responses=document_response(ReprocessingDocument, 404))
 def cancel_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
-    """Stop a reprocessing; one that has ended stays as it is."""
+    """Cancel a reprocessing.
+
+    One that has ended stays as it is.
+    """
     return json_response(reprocessings.cancel(caller, reprocessing_id))
 
 
 @router.post("/{reprocessing_id}/accept", responses=document_response(ReprocessingDocument, 404, 409))
 def accept_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
-    """Make the new results current. Those of before are kept: `GET /v1/decodes/{decode_id}/versions`."""
+    """Accept the results of a reprocessing.
+
+    They become current. Those of before are kept: `GET /v1/decodes/{decode_id}/versions`.
+    """
     return json_response(reprocessings.accept(caller, reprocessing_id))
 
 
@@ -139,5 +156,8 @@ def accept_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reproce
 def list_decode_versions(
     decode_id: Annotated[Identifier, Path(description="Id of the decode.")], caller: Caller, reprocessings: Service
 ) -> Response:
-    """Results of a decode that were replaced by reprocessings, newest first."""
+    """List the earlier results of a decode.
+
+    Those that were replaced by reprocessings, newest first.
+    """
     return json_response(reprocessings.versions(caller, decode_id))

@@ -192,7 +192,10 @@ Roads = Annotated[RoadsService, use_case(lambda cases: cases.roads)]
     },
 )
 def post_road(road: RoadIn, caller: Caller, roads: Roads, idempotency: Idempotency) -> Response:
-    """Register a road. The markers that name it get the measure and offset of their position."""
+    """Register a road.
+
+    The markers that name it get the measure and offset of their position.
+    """
     new = NewRoad(
         road.name,
         road.lines(road.geometry),
@@ -214,20 +217,29 @@ def list_roads(
     limit: PageSize = 100,
     after: LastId = None,
 ) -> Response:
-    """Roads in the order they were registered, without their geometry."""
+    """List the roads of an agency.
+
+    In the order they were registered, without their geometry.
+    """
     page, last = roads.page(caller, name=name, after=after, limit=limit)
     return page_response(request, page, after=last)
 
 
 @router.get("/{road_id}", responses={**NOT_MODIFIED, **document_response(RoadDocument, 404)})
 def get_road(road_id: RoadId, caller: Caller, roads: Roads, if_none_match: IfNoneMatch = None) -> Response:
-    """One road, with its version as ETag."""
+    """Get a road.
+
+    With its version as ETag.
+    """
     return versioned_response(roads.get(caller, road_id), if_none_match)
 
 
 @router.patch("/{road_id}", responses=document_response(ChangedRoad, 404, 412, 428))
 def patch_road(road_id: RoadId, patch: RoadPatch, caller: Caller, roads: Roads, version: Version) -> Response:
-    """Change a road's axis or calibration. Its markers stay where they are; their measures follow."""
+    """Change a road's axis or calibration.
+
+    Its markers stay where they are; their measures follow.
+    """
     if patch.geometry is None and patch.calibration is None:
         raise InvalidParameter(
             "the patch changes nothing",
@@ -255,7 +267,10 @@ def list_road_versions(
     limit: Annotated[int, Query(ge=1, le=100)] = 10,
     after: AfterVersion = 0,
 ) -> Response:
-    """The road's history, oldest first."""
+    """List the versions of a road.
+
+    Oldest first.
+    """
     page, last = roads.history(caller, road_id, after=after, limit=limit)
     return page_response(request, page, after=last)
 
@@ -270,7 +285,10 @@ def locate_on_road(
     max_offset_m: Annotated[float, Query(gt=0, le=MAX_REACH_M, allow_inf_nan=False)] = 100.0,
     version: _OfVersion = None,
 ) -> Response:
-    """Measure and offset of a position, left positive; several feet where the road passes more than once."""
+    """Convert a position to a measure on a road.
+
+    Measure and offset, left positive; several feet where the road passes more than once.
+    """
     many = roads.locate(caller, road_id, [(lon, lat)], max_offset_m, version)
     return json_response(RoadLocated(**_of(many), **many["items"][0]))
 
@@ -279,7 +297,10 @@ def locate_on_road(
 def locate_many_on_road(
     road_id: RoadId, body: PositionsIn, caller: Caller, roads: Roads, version: _OfVersion = None
 ) -> Response:
-    """Measures and offsets of up to 1000 positions."""
+    """Convert up to 1000 positions to measures on a road.
+
+    Measures and offsets.
+    """
     positions = [(position[0], position[1]) for position in body.positions]
     return json_response(roads.locate(caller, road_id, positions, body.max_offset_m, version))
 
@@ -293,7 +314,10 @@ def get_position_on_road(
     offset_m: Annotated[float, Query(ge=-MAX_OFFSET_M, le=MAX_OFFSET_M, allow_inf_nan=False)] = 0.0,
     version: _OfVersion = None,
 ) -> Response:
-    """Position of a measure and an offset; refused where the measure is on no road, several where it repeats."""
+    """Convert a measure on a road to a position.
+
+    With an offset. Refused where the measure is on no road, several where it repeats.
+    """
     many = roads.place(caller, road_id, [(measure_m, offset_m)], version)
     document = RoadPlaced(**_of(many), **many["items"][0])
     if not document["places"]:
@@ -311,7 +335,10 @@ def get_position_on_road(
 def get_positions_on_road(
     road_id: RoadId, body: ReferencesIn, caller: Caller, roads: Roads, version: _OfVersion = None
 ) -> Response:
-    """Positions of up to 1000 measures and offsets; no place where a measure is on no road."""
+    """Convert up to 1000 measures on a road to positions.
+
+    With offsets; no place where a measure is on no road.
+    """
     references = [(reference.measure_m, reference.offset_m) for reference in body.references]
     return json_response(roads.place(caller, road_id, references, version))
 
@@ -329,7 +356,10 @@ def list_markers_on_road(
     limit: PageSize = 100,
     after: AfterLink = None,
 ) -> Response:
-    """Markers on the road in the order of their measures."""
+    """List the markers on a road.
+
+    In the order of their measures.
+    """
     page, last = roads.markers(
         caller,
         road_id,

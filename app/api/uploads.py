@@ -346,7 +346,9 @@ async def _started(request: Request, caller: Caller, uploads: Service) -> Upload
     },
 )
 async def post_upload(response: Annotated[Response, Depends(_created)]) -> Response:
-    """Start an upload by tus 1.0 (creation, creation-with-upload), or by JSON one whose parts go to S3 directly.
+    """Start an upload in parts.
+
+    By tus 1.0 (creation, creation-with-upload), or by JSON one whose parts go to S3 directly.
 
     Upload-Length is the size of the whole file. Upload-Metadata may have `filename`, `context` (the JSON of
     `Waymark-Context`) and `vehicle`. What is refused later, e.g. a file of no known kind, is refused by its last part.
@@ -356,13 +358,19 @@ async def post_upload(response: Annotated[Response, Depends(_created)]) -> Respo
 
 @router.post("/{upload_id}/complete", responses=document_response(UploadDocument, 404, 409, 410, 423))
 def complete_upload(upload_id: UploadId, caller: Caller, uploads: Service, body: CompleteIn) -> Response:
-    """Make the parts that were sent to S3 one file, and the file a decode; a repeated request gets the same answer."""
+    """Complete an upload whose parts were sent to S3.
+
+    They become one file, and the file a decode; a repeated request gets the same answer.
+    """
     return json_response(uploads.complete_parts(caller, upload_id, body.etags))
 
 
 @router.get("/{upload_id}", responses=document_response(UploadDocument, 404, 410))
 def get_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
-    """One upload: its offset, and its decode or the reason of its refusal."""
+    """Get an upload.
+
+    Its offset, and its decode or the reason of its refusal.
+    """
     document = uploads.get(caller, upload_id)
     return json_response(document, headers=described(document))
 
@@ -372,7 +380,10 @@ def get_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Respons
     responses={200: {"description": "Upload-Offset is the number of bytes stored"}, **problem_responses(404, 410, 412)},
 )
 def head_upload(request: Request, upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
-    """How far an upload is (tus 1.0), and in `Waymark-Decode` the decode that it became."""
+    """Get how far an upload is.
+
+    By tus 1.0; `Waymark-Decode` names the decode that it became.
+    """
     check_version(request)
     return Response(headers=described(uploads.get(caller, upload_id)))
 
@@ -408,24 +419,33 @@ async def _patched(request: Request, upload_id: UploadId, caller: Caller, upload
     },
 )
 async def patch_upload(headers: Annotated[dict[str, str], Depends(_patched)]) -> Response:
-    """Append a part (tus 1.0). The last one makes the file a decode; what arrives of an interrupted one stays."""
+    """Append a part to an upload.
+
+    By tus 1.0. The last part makes the file a decode; what arrives of an interrupted one stays.
+    """
     return Response(status_code=204, headers=headers)
 
 
 @router.delete("/{upload_id}", status_code=204, responses={**_NO_CONTENT, **problem_responses(404, 410, 412, 423)})
 def delete_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
-    """Give an upload up (tus 1.0, termination). The decode of a complete one stays."""
+    """Give an upload up.
+
+    By tus 1.0, termination. The decode of a complete one stays.
+    """
     uploads.delete(caller, upload_id)
     return Response(status_code=204, headers={"Tus-Resumable": "1.0.0"})
 
 
 @router.options("", responses={**_OPTIONS, **problem_responses()})
 async def list_options(uploads: Service) -> Response:
-    """Version, extensions and limits of tus."""
+    """List the version, extensions and limits of tus."""
     return Response(headers=options(uploads.rules.max_bytes))
 
 
 @router.options("/{upload_id}", responses={**_OPTIONS, **problem_responses()})
 async def list_upload_options(upload_id: UploadId, uploads: Service) -> Response:
-    """As OPTIONS /v1/uploads, whether there is such an upload or not."""
+    """List the version, extensions and limits of tus for an upload.
+
+    Whether there is such an upload or not.
+    """
     return Response(headers=options(uploads.rules.max_bytes))

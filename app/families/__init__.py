@@ -5,7 +5,9 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable
 from functools import reduce
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Discriminator
 
 from app.families.cerpm import CERPM
 from app.families.family import Family
@@ -31,3 +33,8 @@ def get_family(name: str) -> Family[Any, Any]:
 def union_of(shapes: Iterable[Any]) -> Any:
     """The union of a shape that each family declares, for the schemas of requests and responses."""
     return reduce(operator.or_, shapes)
+
+
+def union_of_documents(documents: Iterable[Any]) -> Any:
+    """The union of the documents of families; the member `family` says which of them a document is."""
+    return Annotated[union_of(documents), Discriminator("family")]

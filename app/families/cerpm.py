@@ -279,6 +279,7 @@ class CerpmSpec(TypedDict):
 class CerpmDocument(MarkerDocument, CerpmSpec):
     """A CERPM."""
 
+    family: Literal["cerpm"]
     code: CerpmCodeDocument
 
 
@@ -287,6 +288,7 @@ def cerpm_document(row: MarkerRow) -> CerpmDocument:
     spec: CerpmSpec = row.spec
     return {
         **marker_head(row),
+        "family": "cerpm",
         "code": {"scheme": "cerpm", "text": row.digits, "number": int(row.digits)},
         "side": spec["side"],
         "speed_limit": spec["speed_limit"],

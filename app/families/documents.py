@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Annotated, Any, Literal, NotRequired
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
-from typing_extensions import TypedDict
+from typing_extensions import ReadOnly, TypedDict
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.families.surveys import NewMarker
@@ -54,7 +54,6 @@ class MarkerHead(TypedDict):
     """Which marker it is."""
 
     id: str
-    family: str
     status: Status
     version: int
 
@@ -77,12 +76,14 @@ class MarkerPlace(TypedDict):
 
 
 class MarkerDocument(MarkerHead, MarkerPlace):
-    """What markers of every family have; each family adds its code and what else it has."""
+    """What markers of every family have; each family adds its name, its code and what else it has."""
+
+    family: ReadOnly[str]
 
 
 def marker_head(row: MarkerRow) -> MarkerHead:
-    """Id, family, status and version of a row."""
-    return {"id": row.id, "family": row.family, "status": row.status, "version": row.version}
+    """Id, status and version of a row."""
+    return {"id": row.id, "status": row.status, "version": row.version}
 
 
 def marker_place(row: MarkerRow) -> MarkerPlace:

@@ -173,6 +173,7 @@ class FiducialGeometryDocument(TypedDict):
 class FiducialDocument(MarkerDocument):
     """An ArUco or AprilTag sign."""
 
+    family: Literal["fiducial"]
     code: FiducialCodeDocument
     geometry: FiducialGeometryDocument
 
@@ -182,6 +183,7 @@ def fiducial_document(row: MarkerRow) -> FiducialDocument:
     spec: FiducialGeometryDocument = row.spec
     return {
         **marker_head(row),
+        "family": "fiducial",
         "code": {
             "scheme": row.scheme,
             "text": row.digits,
@@ -226,6 +228,7 @@ class FiducialSearch:
 class FiducialReadingDocument(TypedDict):
     """A candidate sign in a frame and what was read from it."""
 
+    family: Literal["fiducial"]
     outcome: str
     reason: str | None
     digits: str | None
@@ -273,6 +276,7 @@ class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
         """A reading as clients see it."""
         code = reading.code
         return {
+            "family": "fiducial",
             "outcome": str(reading.outcome),
             "reason": reading.reason or None,
             "digits": code.text if code else None,

@@ -63,7 +63,9 @@ Outputs = Annotated[DecodeOutputs, use_case(lambda cases: cases.decode_outputs)]
     },
 )
 def post_decode(caller: Caller, upload: Upload, decodes: Decodes) -> Response:
-    """Decode a frame, a magnetometer trace or a packet log (answered at once), a ZIP of frames or a long log (queued).
+    """Decode an upload of a vehicle.
+
+    A frame, a magnetometer trace or a packet log (answered at once), a ZIP of frames or a long log (queued).
 
     A trace is announced by `trace` in its context; its file is METRO's stream, the recorder's or plain CSV, Parquet, or
     a ZIP of the files of one recording, CAN logs with them.
@@ -93,17 +95,23 @@ def list_decodes(
     since: Annotated[Time | None, Query(description="Uploaded then or later.")] = None,
     until: Annotated[Time | None, Query(description="Uploaded before then.")] = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """Decodes without their results, newest first."""
+    """List the decodes of an agency.
+
+    Without their results, newest first.
+    """
     wanted = DecodeFilter(state=state, kind=kind, vehicle=vehicle, since=since, until=until)
-    page, last = decodes.page(caller, wanted, before=before, limit=limit)
-    return page_response(request, {"items": page}, before=last)
+    page, last = decodes.page(caller, wanted, before=after, limit=limit)
+    return page_response(request, {"items": page}, after=last)
 
 
 @router.get("/{decode_id}", responses=document_response(DecodeDocument, 404))
 def get_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
-    """One decode with its result, or its progress."""
+    """Get a decode.
+
+    With its result, or its progress.
+    """
     document = decodes.get(caller, decode_id)
     waiting = document["state"] in ("queued", "running")
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
@@ -111,7 +119,10 @@ def get_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Respons
 
 @router.post("/{decode_id}/cancel", responses=document_response(DecodeDocument, 404))
 def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
-    """Ask a queued or running decode to stop; a finished one stays as it is."""
+    """Cancel a decode.
+
+    A finished one stays as it is.
+    """
     return json_response(decodes.cancel(caller, decode_id))
 
 
@@ -119,7 +130,10 @@ def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Resp
     "/{decode_id}/plot.svg", responses={**file_response(["image/svg+xml"]), **NOT_MODIFIED, **problem_responses(404)}
 )
 def get_plot(decode_id: DecodeId, caller: Caller, outputs: Outputs, if_none_match: IfNoneMatch = None) -> Response:
-    """What was found: magnets, tags and line crossings in a trace, or the lane and the radio of a packet log."""
+    """Get the plot of a decode.
+
+    Magnets, tags and line crossings in a trace, or the lane and the radio of a packet log.
+    """
     headers = {"ETag": f'"{decode_id}-plot"', "Cache-Control": "private, no-cache"}
     plot = outputs.plot(caller, decode_id)
     if if_none_match == headers["ETag"]:
@@ -131,39 +145,45 @@ def get_plot(decode_id: DecodeId, caller: Caller, outputs: Outputs, if_none_matc
     "/{decode_id}/lane.geojson", responses={**file_response(["application/geo+json"]), **problem_responses(404)}
 )
 def get_lane(decode_id: DecodeId, caller: Caller, outputs: Outputs) -> Response:
-    """Path, boundaries and markers that a packet log gave, as GeoJSON."""
+    """Get the lane that a packet log gave.
+
+    Path, boundaries and markers, as GeoJSON.
+    """
     answer = json_response(outputs.lane(caller, decode_id))
     answer.headers["Content-Type"] = "application/geo+json"
     return answer
 
 
 @router.get(
-    "/{decode_id}/overlay.{suffix}",
+    "/{decode_id}/overlay.{form}",
     responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_overlay(
     decode_id: DecodeId,
-    suffix: Literal["png", "jpg"],
+    form: Literal["png", "jpg"],
     caller: Caller,
     decodes: Decodes,
     outputs: Outputs,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """The camera frame of a packet log with the lane drawn over it, drawn when it is asked for."""
-    headers = {"ETag": f'"{decode_id}-overlay-{suffix}"', "Cache-Control": "private, no-cache"}
+    """Get the camera frame of a packet log with the lane.
+
+    It is drawn when it is asked for.
+    """
+    headers = {"ETag": f'"{decode_id}-overlay-{form}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         decodes.get(caller, decode_id)
         return Response(status_code=304, headers=headers)
-    return Response(outputs.overlay(caller, decode_id, suffix), headers=headers, media_type=_MEDIA_TYPES[suffix])
+    return Response(outputs.overlay(caller, decode_id, form), headers=headers, media_type=_MEDIA_TYPES[form])
 
 
 @router.get(
-    "/{decode_id}/annotated.{suffix}",
+    "/{decode_id}/annotated.{form}",
     responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_annotated(
     decode_id: DecodeId,
-    suffix: Literal["png", "jpg"],
+    form: Literal["png", "jpg"],
     caller: Caller,
     decodes: Decodes,
     outputs: Outputs,
@@ -171,17 +191,19 @@ def get_annotated(
     outlines: Annotated[bool, Query(description="false: the frame as it is.")] = True,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """The frame with outlines, digits and confidence of its readings, drawn when it is asked for.
+    """Get a frame with its readings drawn on it.
+
+    Outlines, digits and confidence, drawn when it is asked for.
 
     Of a video, only frames in which something was found.
     """
-    form = suffix if outlines else f"{suffix}-plain"
-    headers = {"ETag": f'"{decode_id}-{frame}-{form}"', "Cache-Control": "private, no-cache"}
+    shown = form if outlines else f"{form}-plain"
+    headers = {"ETag": f'"{decode_id}-{frame}-{shown}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         decodes.get(caller, decode_id)
         return Response(status_code=304, headers=headers)
-    picture = outputs.annotated(caller, decode_id, suffix, frame, outlined=outlines)
-    return Response(picture, headers=headers, media_type=_MEDIA_TYPES[suffix])
+    picture = outputs.annotated(caller, decode_id, form, frame, outlined=outlines)
+    return Response(picture, headers=headers, media_type=_MEDIA_TYPES[form])
 
 
 # === /v1/decodes/{decode_id}: samples, packets, the vehicle's track and lists of readings of one decode.
@@ -208,14 +230,20 @@ def get_samples(
     to_s: Annotated[float | None, Query(allow_inf_nan=False, description="Of the recording. [s]")] = None,
     points: Annotated[int, Query(ge=100, le=MAX_POINTS, description="Of each series at most.")] = 100_000,
 ) -> Response:
-    """Samples of a trace, to plot them: all between two times, or the extremes of groups of them."""
+    """Get the samples of a trace to plot them.
+
+    All between two times, or the extremes of groups of them.
+    """
     document = details.samples(caller, decode_id, series=series or (), from_s=from_s, to_s=to_s, points=points)
     return json_response(document)
 
 
 @detail_router.get("/{decode_id}/packets", responses=document_response(PacketsDocument, 404))
 def get_packets(decode_id: DecodeId, caller: Caller, details: Details) -> Response:
-    """Packets of a log with time, strength and verdict, and the vehicle's track beside them."""
+    """Get the packets of a log.
+
+    With time, strength and verdict, and the vehicle's track beside them.
+    """
     return json_response(details.packets(caller, decode_id))
 
 
@@ -225,7 +253,9 @@ def get_packets(decode_id: DecodeId, caller: Caller, details: Details) -> Respon
 def get_decode_track(
     decode_id: DecodeId, form: Literal["geojson", "csv", "gpx"], caller: Caller, details: Details
 ) -> Response:
-    """The vehicle's track by this decode alone: fixes, poses, its receiver, or dead reckoning between tags.
+    """Download the vehicle's track by one decode.
+
+    Fixes, poses, its receiver, or dead reckoning between tags.
 
     A drive (`/v1/drives`) estimates the best track from several decodes.
     """
@@ -237,7 +267,10 @@ def get_decode_track(
     responses={**file_response([_FILE_MEDIA_TYPES[form] for form in ("geojson", "csv")]), **problem_responses(404)},
 )
 def get_readings(decode_id: DecodeId, form: Literal["geojson", "csv"], caller: Caller, details: Details) -> Response:
-    """All readings in the order of their times, with confidence, reason and marker."""
+    """Download the readings of a decode.
+
+    In the order of their times, with confidence, reason and marker.
+    """
     return _file(details.readings(caller, decode_id, form), f"readings-{decode_id}.{form}", form)
 
 

@@ -7,6 +7,7 @@ a test compares it with the app's own document, which does not depend on setting
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from fastapi.routing import APIRoute
 
 from app.api.http.middleware import is_protected
 from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
-from app.api.http.problems import component_schemas
+from app.api.http.problems import MEDIA_TYPE, component_schemas
 
+_RESPONSES = "#/components/responses/"
 STORED = Path(__file__).with_name("data") / "openapi.json"
 DESCRIPTION = """The registry of machine-readable roads: coded plates, magnet tags, radio markers (CERPMs) and fiducial
 signs, from the plan of a road to artwork and surveys, and to the decoded uploads and drives of vehicles.
@@ -28,36 +30,35 @@ latitude in degrees; headings are clockwise from true north.
 """
 
 _TAGS = {
-    "markers": "Markers of every family: surveyed positions, states, history, bulk writes and searches.",
-    "artwork": "Printable plates and signs, with proofs of what a camera reads.",
-    "layouts": "Magnet tags: holes to drill for a meaning.",
-    "cerpms": "Radio markers: keys, frames, and how far they are heard.",
-    "codebooks": "Meanings of magnet tags.",
-    "roads": "Road axes, stations along them, and the markers beside them.",
-    "plans": "Plans of a road: alignments, rules, placement, proofs, files for crews, and commits.",
-    "imports": "Surveys and tables that become markers.",
-    "exports": "Markers as files.",
-    "uploads": "Files that vehicles send: in one request, resumed, or in parts of an S3 store.",
-    "decodes": "What was read in photos, videos, traces and packet logs, against the registry.",
-    "drives": "Several decodes of one vehicle as one track.",
-    "maintenance": "Markers that vehicles found missing, moved, cloned, reversed or fading; people decide.",
-    "public pages": "Pages of markers that need no key, what agencies release on them, and damage reports.",
-    "jobs": "Work that goes on after the answer: state, progress, cancellation.",
-    "events": "What happened, as it happens.",
-    "webhooks": "Signed messages to your server when jobs end and markers become suspect.",
-    "reprocessing": "New versions of the decoders over stored uploads, and what they change.",
-    "fleet": "Vehicles, cameras and their calibrations.",
-    "snapshots": "Files of the registry for vehicles that decode offline.",
-    "audit": "The log of all changes, chained by hashes.",
     "access": (
         "Keys and agencies. An admin of an agency manages its keys at `/v1/keys`. The server's operator creates an"
         " agency and its first admin key with `POST /v1/agencies`, using a key that `waymark key --operator` printed on"
         " the server's machine."
     ),
+    "roads": "Road axes, stations along them, and the markers beside them.",
+    "imports": "Surveys and tables that become markers.",
+    "markers": "Markers of every family: surveyed positions, states, history, bulk writes and searches.",
+    "codebooks": "Meanings of magnet tags.",
+    "artwork": "Printable plates and signs with proofs of what a camera reads, and drilling sheets of magnet tags.",
+    "cerpms": "Radio markers: keys, frames, and how far they are heard.",
+    "plans": "Plans of a road: alignments, rules, placement, proofs, files for crews, and commits.",
+    "fleet": "Vehicles, cameras and their calibrations.",
+    "uploads": "Files that vehicles send: in one request, resumed, or in parts of an S3 store.",
+    "decodes": "What was read in photos, videos, traces and packet logs, against the registry.",
+    "drives": "Several decodes of one vehicle as one track.",
+    "marker health": "Markers that vehicles found missing, moved, cloned, reversed or fading; people decide.",
+    "public pages": "Pages of markers that need no key, what agencies release on them, and damage reports.",
+    "reprocessing": "New versions of the decoders over stored uploads, and what they change.",
+    "snapshots": "Files of the registry for vehicles that decode offline.",
+    "exports": "Markers as files.",
     "ogc": "OGC API Features and Tiles, for GIS clients.",
+    "jobs": "Work that goes on after the answer: state, progress, cancellation.",
+    "events": "What happened, as it happens.",
+    "webhooks": "Signed messages to your server when jobs end and markers become suspect.",
+    "audit": "The log of all changes, chained by hashes.",
     "system": "Health of the server, and what it runs.",
 }
-"""The parts of the API in the order in which /docs shows them."""
+"""The parts of the API in the order of a user's work, in which /docs shows them."""
 
 
 def operation_id(route: APIRoute) -> str:
@@ -78,6 +79,7 @@ def describe(app: FastAPI) -> None:
             schemas = components.get("schemas", {}) | component_schemas()
             components["schemas"] = dict(sorted(schemas.items()))  # else in the order of the first requests
             components["securitySchemes"] = SECURITY_SCHEMES
+            components["responses"] = _share_problems(document)
             _require_keys(document)
             _describe_headers(document)
             app.openapi_schema = document
@@ -92,6 +94,28 @@ def stored_text(document: dict[str, Any]) -> str:
 
 
 _LICENSE = {"name": "Apache-2.0", "identifier": "Apache-2.0"}
+
+
+def _share_problems(document: dict[str, Any]) -> dict[str, Any]:
+    """Move the problem responses that several operations have out of them; they refer to them by name.
+
+    The name is `Problem` and the status; `ProblemOrPage` where browsers get a page instead.
+    """
+    problems = [
+        (operation["responses"], status, response)
+        for operations in document["paths"].values()
+        for operation in operations.values()
+        for status, response in operation["responses"].items()
+        if MEDIA_TYPE in response.get("content", {})
+    ]
+    uses = Counter(json.dumps(response) for _, _, response in problems)
+    shared = {}
+    for responses, status, response in problems:
+        if uses[json.dumps(response)] > 1:
+            name = f"{'ProblemOrPage' if 'text/html' in response['content'] else 'Problem'}{status}"
+            shared[name] = response
+            responses[status] = {"$ref": f"{_RESPONSES}{name}"}
+    return dict(sorted(shared.items()))
 
 
 def _require_keys(document: dict[str, Any]) -> None:

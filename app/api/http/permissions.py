@@ -182,8 +182,8 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/decodes/{decode_id}/track.{form}": EVERYBODY,
     "GET /v1/decodes/{decode_id}/readings.{form}": EVERYBODY,
     "GET /v1/decodes/{decode_id}/lane.geojson": EVERYBODY,
-    "GET /v1/decodes/{decode_id}/overlay.{suffix}": EVERYBODY,
-    "GET /v1/decodes/{decode_id}/annotated.{suffix}": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/overlay.{form}": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/annotated.{form}": EVERYBODY,
     # --- uploads in parts
     "POST /v1/uploads": UPLOADERS,
     "OPTIONS /v1/uploads": UPLOADERS,

@@ -93,7 +93,7 @@ async def _fault_of(check: Callable[[], str | None]) -> str | None:
 
 @router.get("/healthz", responses={200: {"model": ProcessHealth}})
 async def get_health() -> Response:
-    """Whether the process responds."""
+    """Check whether the process responds."""
     return json_response(ProcessHealth(status="ok"))
 
 
@@ -105,8 +105,11 @@ async def get_health() -> Response:
     },
 )
 async def get_readiness(request: Request) -> Response:
-    """Every part that requests need is ready: the database answers and is migrated, the decoders run, and what is
-    stored can be read again. The result is at most two seconds old."""
+    """Check whether every part that requests need is ready.
+
+    Every part that requests need is ready: the database answers and is migrated, the decoders run, and what is stored
+    can be read again. The result is at most two seconds old.
+    """
     parts = await request.app.state.readiness.parts()
     ready = all(parts.values())
     document = ReadinessDocument(status="ready" if ready else "not ready", parts=parts)
@@ -115,7 +118,10 @@ async def get_readiness(request: Request) -> Response:
 
 @router.get("/metrics", responses=text_response("text/plain", "Prometheus text format"))
 def get_metrics(request: Request) -> Response:
-    """Prometheus metrics."""
+    """Get the server's metrics.
+
+    In the format of Prometheus.
+    """
     return Response(written_metrics(request.app.state.metrics), media_type=CONTENT_TYPE_LATEST)
 
 
@@ -154,7 +160,10 @@ class PageSettings(TypedDict):
 
 @page_settings_router.get("", responses=document_response(PageSettings))
 async def get_page_settings(request: Request) -> Response:
-    """Sign-in, base map and guide of the web pages. Needs no key."""
+    """Get the settings of the web pages.
+
+    Sign-in, base map and guide. Needs no key.
+    """
     return json_response(request.app.state.page_settings)
 
 
@@ -193,5 +202,5 @@ class ServerSettings(TypedDict):
 
 @server_settings_router.get("", responses=document_response(ServerSettings))
 async def get_server_settings(request: Request, caller: Caller) -> Response:
-    """The settings that the server runs with."""
+    """Get the settings that the server runs with."""
     return json_response(request.app.state.server_settings)

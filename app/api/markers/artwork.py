@@ -92,7 +92,9 @@ def get_artwork(
     resolution_dpi: Annotated[Resolution, Query(description="Of a PNG. [1/inch]")] = 150.0,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """Artwork at true size. It was rendered and read back before it is sent; `Waymark-Proof` holds what was read.
+    """Download the artwork of a marker at true size.
+
+    It was rendered and read back before it is sent; `Waymark-Proof` holds what was read.
 
     The QR code on the margin has the address of the marker's public page. Without a public address of the server the
     artwork has none, and the margin and `Waymark-QR-Code` state the reason.
@@ -128,7 +130,9 @@ def post_artwork(
     idempotency: Idempotency,
     prefer: Prefer = None,
 ) -> Response:
-    """Artwork of a selection as a ZIP with a manifest and a quality sheet; every plate was read back first.
+    """Make the artwork of several markers.
+
+    A ZIP with a manifest and a quality sheet; every plate was read back first.
 
     More than 10 plates, or any with `Prefer: respond-async`, become a job: 202, with the ZIP at its `links.result`.
     Without a public address of the server the plates have no QR codes; `notes` of the manifest states the reason.
@@ -158,7 +162,7 @@ def _chunks(bundle: Bundle) -> Iterator[bytes]:
 # === Layouts of magnet markers as drilling sheets.
 
 
-layout_router = APIRouter(prefix="/v1/markers", tags=["layouts"], route_class=StrictRoute)
+layout_router = APIRouter(prefix="/v1/markers", tags=["artwork"], route_class=StrictRoute)
 
 
 @layout_router.get(
@@ -176,7 +180,10 @@ def get_layout(
     layouts: Annotated[Layouts, use_case(lambda cases: cases.layouts)],
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """Drilling sheet of a magnet marker: holes with polarity and orientation, checks, materials and costs."""
+    """Download the drilling sheet of a magnet marker.
+
+    Holes with polarity and orientation, checks, materials and costs.
+    """
     headers = {"ETag": f'"{layouts.tag(caller, marker_id, form)}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         return Response(status_code=304, headers=headers)
@@ -234,7 +241,10 @@ def get_payload(
         int | None, Query(ge=0, le=MAX_SEQUENCE, description="Which transmission; the next one if left out.")
     ] = None,
 ) -> Response:
-    """What a CERPM sends: the 24 bytes, a dump that explains them, or both as JSON. Takes a key that may write."""
+    """Download the message that a CERPM sends.
+
+    The 24 bytes, a dump that explains them, or both as JSON. Takes a key that may write.
+    """
     payload = programs.payload(caller, marker_id, sequence)
     headers = {
         "Cache-Control": "private, no-store",
@@ -250,7 +260,10 @@ def get_payload(
 
 @program_router.post("/programs", responses={**text_response("text/csv"), **problem_responses(404)})
 def post_programs(wanted: ProgramsIn, caller: Caller, programs: Programs) -> Response:
-    """Table for programming a selection of CERPMs, CSV: one row a marker, with its key only if that is asked for."""
+    """Make a table for programming several CERPMs.
+
+    CSV: one row a marker, with its key only if that is asked for.
+    """
     table = programs.programs_csv(caller, wanted.selection(), with_keys=wanted.with_keys)
     headers = {"Content-Disposition": 'attachment; filename="cerpm-programs.csv"', "Cache-Control": "private, no-store"}
     return Response(table, headers=headers, media_type="text/csv")

@@ -145,7 +145,10 @@ Service = Annotated[Codebooks, use_case(lambda cases: cases.codebooks)]
 
 @router.post("", status_code=201, responses=document_response(CodebookDocument, 409, status=201, description="Made"))
 def post_codebook(wanted: CodebookIn, caller: Caller, codebooks: Service, idempotency: Idempotency) -> Response:
-    """Make a codebook and give codes to its first meanings. The answer counts those that fit and are distinct."""
+    """Make a codebook.
+
+    Its first meanings get codes. The answer counts those that fit and are distinct.
+    """
     meanings = [meaning.pair for meaning in wanted.meanings]
     document, replayed = codebooks.make(
         caller, wanted.name, wanted.design.given(), wanted.rules.given(), meanings, idempotency
@@ -161,7 +164,10 @@ def list_codebooks(
     limit: Annotated[int, Query(ge=1, le=100)] = 100,
     after: LastId = None,
 ) -> Response:
-    """Codebooks in the order they were made, without their entries."""
+    """List the codebooks of an agency.
+
+    In the order they were made, without their entries.
+    """
     page, last = codebooks.page(caller, after=after, limit=limit)
     return page_response(request, page, after=last)
 
@@ -170,7 +176,10 @@ def list_codebooks(
 def get_codebook(
     codebook_id: CodebookId, caller: Caller, codebooks: Service, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """One codebook with its entries, with its version as ETag."""
+    """Get a codebook with its entries.
+
+    With its version as ETag.
+    """
     return versioned_response(codebooks.get(caller, codebook_id), if_none_match)
 
 
@@ -182,7 +191,10 @@ def get_codebook(
 def post_entries(
     codebook_id: CodebookId, wanted: MeaningsIn, caller: Caller, codebooks: Service, idempotency: Idempotency
 ) -> Response:
-    """Give codes to further meanings: all of them or none. Codes given before stay as they are."""
+    """Add meanings to a codebook.
+
+    They get codes: all of them or none. Codes given before stay as they are.
+    """
     meanings = [meaning.pair for meaning in wanted.meanings]
     document, replayed = codebooks.add_meanings(caller, codebook_id, meanings, idempotency)
     return created_response(document, replayed)
@@ -196,7 +208,10 @@ def list_entries(
     kind: Annotated[Text | None, Query(max_length=40, examples=["bend-right"])] = None,
     value: Annotated[Text | None, Query(max_length=80, examples=["125"])] = None,
 ) -> Response:
-    """Entries of a codebook in the order they were given; with `kind` and `value` the one with this meaning."""
+    """List the entries of a codebook.
+
+    In the order they were given; with `kind` and `value` the one with this meaning.
+    """
     return json_response(codebooks.list_entries(caller, codebook_id, _meaning(kind, value)))
 
 
@@ -207,7 +222,7 @@ def get_entry(
     caller: Caller,
     codebooks: Service,
 ) -> Response:
-    """What a code means."""
+    """Get what a code of a codebook means."""
     return json_response(codebooks.entry(caller, codebook_id, code))
 
 
@@ -235,5 +250,8 @@ draft_router = APIRouter(prefix="/v1/codebook-drafts", tags=["codebooks"], route
 
 @draft_router.post("", responses=document_response(CodebookDraftDocument))
 def post_codebook_draft(wanted: CodebookDraftIn, caller: Caller) -> Response:
-    """How many codes a design has, how many fit the rules, and the first 200 of them."""
+    """Count the codes of a design of a codebook.
+
+    How many there are, how many fit the rules, and the first 200 of them.
+    """
     return json_response(codebook_draft(wanted.design.given(), wanted.rules.given()))

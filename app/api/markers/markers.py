@@ -171,7 +171,9 @@ class NewMarkerIn(RootModel[_AnyMarkerIn]):
 def post_marker(
     marker: NewMarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency, warnings: Warnings = "store"
 ) -> Response:
-    """Register a marker of any family. With an Idempotency-Key a repeated request gets the first answer again.
+    """Register a marker of any family.
+
+    With an Idempotency-Key a repeated request gets the first answer again.
 
     `position_warnings` of the response name what is probably wrong with the position.
     """
@@ -186,7 +188,10 @@ _PUBLIC_PAGE: Described = {
 
 @router.get("/{marker_id}", responses={**_PUBLIC_PAGE, **NOT_MODIFIED, **document_response(AnyMarkerDetail, 404)})
 def get_marker(marker_id: MarkerId, caller: Caller, markers: Markers, if_none_match: IfNoneMatch = None) -> Response:
-    """One marker, with its version as ETag."""
+    """Get a marker.
+
+    With its version as ETag.
+    """
     return versioned_response(markers.get(caller, marker_id), if_none_match)
 
 
@@ -199,13 +204,19 @@ def patch_marker(
     version: Version,
     warnings: Warnings = "store",
 ) -> Response:
-    """Change a marker that is still at the version named by If-Match; a new position may have `position_warnings`."""
+    """Change a marker.
+
+    One that is still at the version named by If-Match; a new position may have `position_warnings`.
+    """
     return versioned_response(markers.change(caller, marker_id, patch.change(), version, warnings))
 
 
 @router.get("/{marker_id}/accuracy", responses=document_response(AccuracyDocument, 404))
 def get_marker_accuracy(marker_id: MarkerId, caller: Caller, markers: Markers) -> Response:
-    """Accuracy of the marker's survey: NSSDA and ASPRS figures of its RMSE, and whether enough points were checked."""
+    """Get the accuracy of a marker's survey.
+
+    NSSDA and ASPRS figures of its RMSE, and whether enough points were checked.
+    """
     return json_response(markers.accuracy(caller, marker_id))
 
 
@@ -218,7 +229,10 @@ def list_marker_versions(
     limit: PageSize = 100,
     after: AfterVersion = 0,
 ) -> Response:
-    """The marker's history, oldest first."""
+    """List the versions of a marker.
+
+    Oldest first.
+    """
     page, last = markers.history(caller, marker_id, after=after, limit=limit)
     return page_response(request, {"items": page}, after=last)
 
@@ -230,7 +244,7 @@ def get_marker_version(
     caller: Caller,
     markers: Markers,
 ) -> Response:
-    """The marker as one version has it."""
+    """Get a version of a marker."""
     return json_response(markers.version(caller, marker_id, version))
 
 
@@ -253,9 +267,11 @@ def list_marker_observations(
     since: Time | None = None,
     until: Time | None = None,
     limit: PageSize = 100,
-    before: Annotated[Text | None, Query(max_length=120, description="As the link to the next page has it.")] = None,
+    after: Annotated[Text | None, Query(max_length=120, description="As the link to the next page has it.")] = None,
 ) -> Response:
-    """What decodes saw of the marker, newest first.
+    """List the observations of a marker.
+
+    What decodes saw of it, newest first.
 
     `what` is `seen`, `missed`, `ambiguous`, `out-of-place`, `out-of-reach`, `moved`, `cloned`, `wrong-way` or
     `off-line`.
@@ -266,15 +282,18 @@ def list_marker_observations(
         what=what,
         since=since,
         until=until,
-        before=place_of(before) if before is not None else None,
+        before=place_of(after) if after is not None else None,
         limit=limit,
     )
-    return page_response(request, page, before=last)
+    return page_response(request, page, after=last)
 
 
 @observation_router.get("/summary", responses=document_response(ObservationSummary, 404))
 def get_observation_summary(marker_id: MarkerId, caller: Caller, observations: Observations) -> Response:
-    """When the marker was seen first and last, and how often which way."""
+    """Summarise the observations of a marker.
+
+    When it was seen first and last, and how often which way.
+    """
     return json_response(observations.summary(caller, marker_id))
 
 
@@ -356,7 +375,9 @@ Bulk = Annotated[BulkMarkersService, use_case(lambda cases: cases.bulk_markers)]
     },
 )
 def post_bulk(body: BulkIn, request: Request, caller: Caller, bulk: Bulk, idempotency: Idempotency) -> Response:
-    """Register and change up to 1000 markers in one transaction, with a result for each.
+    """Register and change up to 1000 markers in one transaction.
+
+    The response has a result for each.
 
     Refused items of the mode `all` answer 422, with the report in the problem; nothing is stored then.
     """

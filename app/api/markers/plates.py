@@ -125,7 +125,9 @@ Drafts = Annotated[PlateDrafts, use_case(lambda cases: cases.plate_drafts)]
 
 @draft_router.post("", responses=document_response(PlateDraftDocument))
 def post_plate_draft(wanted: PlateDraftIn, caller: Caller, drafts: Drafts) -> Response:
-    """Code, units and every dimension of a plate that is not registered.
+    """Design a plate that is not registered.
+
+    Its code, units and every dimension.
 
     Without a registry number, a plate of the scheme `id` has an example of one: registering it allocates a free one.
     Whether the code is free is not checked.
@@ -141,7 +143,9 @@ def post_plate_draft(wanted: PlateDraftIn, caller: Caller, drafts: Drafts) -> Re
     },
 )
 def post_draft_artwork(form: ArtworkFormat, wanted: DraftArtworkIn, caller: Caller, drafts: Drafts) -> Response:
-    """Artwork of a plate that is not registered, at true size, rendered and read back.
+    """Make the artwork of a plate that is not registered.
+
+    At true size, rendered and read back.
 
     There is no QR code, because the plate is not registered. The margin is labelled "a draft, not registered".
     """
@@ -155,7 +159,9 @@ def post_draft_artwork(form: ArtworkFormat, wanted: DraftArtworkIn, caller: Call
 
 @draft_router.post("/pass", responses=document_response(CameraPassDocument))
 def post_camera_pass(wanted: CameraPassIn, caller: Caller, drafts: Drafts) -> Response:
-    """Frames of a pass of a camera over a plate, rows of each unit, motion blur, and predicted read rates.
+    """Predict what a camera reads of a plate as it passes.
+
+    Frames of the pass, rows of each unit, motion blur, and predicted read rates.
 
     The road is flat and straight. The rates are those that plans predict, by the fitted models of read rates.
     """
@@ -167,7 +173,9 @@ def post_camera_pass(wanted: CameraPassIn, caller: Caller, drafts: Drafts) -> Re
     responses={**file_response(["image/jpeg"], "The picture", headers=_VIEW_HEADERS), **problem_responses()},
 )
 def post_camera_view(wanted: CameraViewIn, caller: Caller, drafts: Drafts) -> Response:
-    """Picture of a plate as a camera sees it in one frame of a pass, to scale and with motion blur; it is decoded too.
+    """Draw a plate as a camera sees it.
+
+    In one frame of a pass, to scale and with motion blur; it is decoded too.
 
     Road, light, sensor and noise are simulated, the same for every picture of a condition.
     """
@@ -307,7 +315,9 @@ def post_print_grade(
         PrintGradeFormat.JSON
     ),
 ) -> Response:
-    """Grade a printed plate by a photo, and predict whether it is read at the design speed.
+    """Grade a printed plate by a photo.
+
+    The response predicts whether it is read at the design speed.
 
     Each parameter has its value, its grade after ISO/IEC 15415, the cause and the cure. A photo that is too small,
     blurred, over-exposed, oblique or unevenly lit is refused with 422. Nothing is stored: the same photo can be sent

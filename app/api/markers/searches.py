@@ -276,12 +276,13 @@ def list_markers(
     limit: PageSize = 100,
     after: LastId = None,
 ) -> Response:
-    """Markers in the order they were registered; with `nearest`, that many in the order of their distance.
+    """List the markers of an agency.
+
+    In the order they were registered; with `nearest`, that many in the order of their distance.
 
     `bbox` is west,south,east,north, and spans the antimeridian where its west is above its east. `near` is lon,lat with
-    `radius_m` or `nearest`, or lon,lat,radius_m. `from_m` and `to_m` are measures on a `road`.
-    With `as_of` the filter is about the markers as they were then; a page may hold fewer than `limit` though `Link`
-    leads on.
+    `radius_m` or `nearest`, or lon,lat,radius_m. `from_m` and `to_m` are measures on a `road`. With `as_of` the filter
+    is about the markers as they were then; a page may hold fewer than `limit` though `Link` leads on.
 
     Magnets are where their first one lies; lists leave out their lanes, magnets, checks and costs.
     """
@@ -299,7 +300,9 @@ def list_markers(
 def search_markers(
     body: SearchIn, request: Request, caller: Caller, searches: Searches, limit: PageSize = 100, after: AfterLink = None
 ) -> Response:
-    """Search by a body: as the list of markers, with polygons of up to 10 000 vertices and corridors along a line.
+    """Search markers by a polygon or a corridor.
+
+    As the list of markers, with polygons of up to 10 000 vertices and corridors along a line.
 
     For the next page send the same body to the address in `Link`.
     """

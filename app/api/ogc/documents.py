@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any
 
-from fastapi import Depends
+from fastapi import APIRouter, Depends
 from starlette.responses import Response
 
 from app import __version__
 from app.api.http.dependencies import Caller
 from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
+from app.api.http.strict_json import StrictRoute
 from app.api.ogc import pages
 from app.api.ogc.edits import READ_ONLY
 from app.api.ogc.pages import html_response
@@ -29,9 +30,11 @@ from app.api.ogc.responses import (
     Conformance,
     ExtentDocument,
     FeaturesService,
+    JsonObject,
     LandingPage,
     Offers,
     answer,
+    describe_read,
     link,
 )
 from app.api.ogc.tiles import TILES_REL
@@ -245,14 +248,20 @@ CONFORMANCE = (
 )
 
 
+router = APIRouter(prefix="/ogc", tags=["ogc"], route_class=StrictRoute)
 IsPage = Annotated[bool, Depends(Offers(JSON, html=True))]
 IsSchemaPage = Annotated[bool, Depends(Offers(SCHEMA, JSON, html=True))]
 OffersSchema = Annotated[bool, Depends(Offers(SCHEMA, JSON))]
 IsApiPage = Annotated[bool, Depends(Offers(OPENAPI, JSON, html=True))]
 
 
+@router.get("", **describe_read(LandingPage))
+@router.get("/", name="landing_page_with_slash", **describe_read(LandingPage))
 def landing_page(is_page: IsPage, base: BaseUrl) -> Response:
-    """Where everything is."""
+    """Get the landing page.
+
+    It links to everything else.
+    """
     links = [
         link(f"{base}/", "self", JSON, "This document"),
         link(f"{base}/?f=html", "alternate", HTML, "This document as HTML"),
@@ -267,21 +276,27 @@ def landing_page(is_page: IsPage, base: BaseUrl) -> Response:
     return html_response(pages.landing_page(base, document)) if is_page else answer(document)
 
 
+@router.get("/conformance", **describe_read(Conformance))
 def get_conformance(is_page: IsPage, base: BaseUrl) -> Response:
-    """The conformance classes."""
+    """List the conformance classes."""
     if is_page:
         return html_response(pages.conformance_page(base, CONFORMANCE))
     return answer(Conformance(conformsTo=list(CONFORMANCE)))
 
 
+@router.get("/api", **describe_read(JsonObject, OPENAPI.partition(";")[0]))
 def get_api(is_page: IsApiPage, base: BaseUrl) -> Response:
-    """The API as OpenAPI 3.0, written for the clients that read it."""
+    """Get the OpenAPI 3.0 document of the OGC API.
+
+    It is written for the clients that read it.
+    """
     document = api_document(base)
     return html_response(pages.api_page(base, document)) if is_page else answer(document, OPENAPI)
 
 
+@router.get("/collections", **describe_read(Collections))
 def list_collections(is_page: IsPage, base: BaseUrl, caller: Caller, features: FeaturesService) -> Response:
-    """All collections."""
+    """List the collections."""
     found = [_described(collection, features.extent(caller, collection), base) for collection in COLLECTIONS.values()]
     if is_page:
         return html_response(pages.collections_page(base, found))
@@ -297,28 +312,38 @@ def list_collections(is_page: IsPage, base: BaseUrl, caller: Caller, features: F
     return answer(document)
 
 
+@router.get("/collections/{collection}", **describe_read(CollectionDocument))
 def get_collection(
     collection: CollectionOf, is_page: IsPage, base: BaseUrl, caller: Caller, features: FeaturesService
 ) -> Response:
-    """One collection."""
+    """Get a collection."""
     document = _described(collection, features.extent(caller, collection), base)
     return html_response(pages.collection_page(base, document, collection)) if is_page else answer(document)
 
 
+@router.get("/collections/{collection}/schema", **describe_read(JsonObject, SCHEMA))
 def get_schema(collection: CollectionOf, is_page: IsSchemaPage, base: BaseUrl) -> Response:
-    """The properties of a collection's features, as JSON Schema with the roles of OGC API Common part 3."""
+    """Get the schema of a collection's properties.
+
+    JSON Schema with the roles of OGC API Common part 3.
+    """
     if is_page:
         return html_response(pages.schema_page(base, collection, "schema", f"Properties of {collection.title}"))
     return answer(property_schema(collection, f"{base}/collections/{collection.id}/schema"), SCHEMA)
 
 
+@router.get("/collections/{collection}/geojson-schema", **describe_read(JsonObject, SCHEMA, html=False))
 def get_geojson_schema(collection: CollectionOf, _offers: OffersSchema, base: BaseUrl) -> Response:
-    """The JSON Schema of a collection's features in GeoJSON."""
+    """Get the schema of a collection's features in GeoJSON."""
     return answer(geojson_schema(collection, f"{base}/collections/{collection.id}/geojson-schema"), SCHEMA)
 
 
+@router.get("/collections/{collection}/queryables", **describe_read(JsonObject, SCHEMA))
 def get_queryables(collection: CollectionOf, is_page: IsSchemaPage, base: BaseUrl) -> Response:
-    """The JSON Schema of what filters can ask of a collection's features."""
+    """Get the properties that filters of a collection can use.
+
+    As JSON Schema.
+    """
     if is_page:
         title = f"What filters can ask of {collection.title}"
         return html_response(pages.schema_page(base, collection, "queryables", title))

@@ -11,14 +11,15 @@ from functools import partial
 from typing import Annotated, Any
 
 import orjson
-from fastapi import Depends, Header, Request
+from fastapi import APIRouter, Depends, Header, Request
 from pydantic import TypeAdapter
 from starlette.responses import Response
 
 from app.api.http.bodies import media_type_of
 from app.api.http.dependencies import Caller, Markers, SentVersion
 from app.api.http.permissions import PERMISSIONS
-from app.api.http.strict_json import in_thread_if_large, validated
+from app.api.http.problems import problem_responses, reference
+from app.api.http.strict_json import StrictRoute, in_thread_if_large, validated
 from app.api.markers.markers import WARNINGS_TEXT, MarkerPatch, NewMarkerIn, patch_marker, post_marker
 from app.api.ogc.responses import (
     GEOJSON,
@@ -28,6 +29,7 @@ from app.api.ogc.responses import (
     EditableCollection,
     FeatureId,
     FeaturesService,
+    NewFeature,
     refuse_parameters,
 )
 from app.errors import InvalidParameter, StaleVersion, UnsupportedUpload
@@ -50,7 +52,11 @@ _SURVEYED = (
 _FIXED = ("family", "scheme", "code")
 READ_ONLY = ("transform_accuracy_m", "localization_grade", "version", "updated_at")
 _NEW_MARKER, _MARKER_PATCH = TypeAdapter(NewMarkerIn), TypeAdapter(MarkerPatch)
-BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
+_BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
+_WITH_BODY = {
+    "requestBody": {"content": {kind: {"schema": reference(NewFeature)} for kind in _BODY_TYPES}, "required": True}
+}
+router = APIRouter(prefix="/ogc/collections/{collection}/items", tags=["ogc"], route_class=StrictRoute)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +100,8 @@ async def get_body(request: Request) -> dict[str, Any]:
         It is not a feature.
     """
     kind = media_type_of(request)
-    if kind not in BODY_TYPES:
-        raise UnsupportedUpload("the body is not GeoJSON", field="Content-Type", limit=", ".join(BODY_TYPES))
+    if kind not in _BODY_TYPES:
+        raise UnsupportedUpload("the body is not GeoJSON", field="Content-Type", limit=", ".join(_BODY_TYPES))
     raw = await request.body()
     body = await in_thread_if_large(len(raw), partial(parse_json, raw))
     if not isinstance(body, dict) or body.get("type", "Feature") != "Feature":
@@ -109,13 +115,21 @@ Edit = Annotated[_Edit, Depends(get_edit)]
 Body = Annotated[dict[str, Any], Depends(get_body)]
 
 
+@router.options("", responses=problem_responses(404))
 async def list_collection_methods(request: Request, collection: CollectionOf, caller: Caller) -> Response:
-    """The methods that the caller may use on a collection's features, as the header Allow."""
+    """List the methods that the caller may use on a collection.
+
+    They are in the header Allow.
+    """
     return _allowed(request, collection, caller, "POST")
 
 
+@router.options("/{feature}", responses=problem_responses(404))
 async def list_feature_methods(request: Request, collection: CollectionOf, caller: Caller, feature: str) -> Response:
-    """The methods that the caller may use on a feature, as the header Allow."""
+    """List the methods that the caller may use on a feature.
+
+    They are in the header Allow.
+    """
     return _allowed(request, collection, caller, "PUT", "PATCH", "DELETE")
 
 
@@ -127,8 +141,12 @@ def _allowed(request: Request, collection: Collection, caller: CallerValue, *edi
     return Response(headers={"Allow": ", ".join(allowed)})
 
 
+@router.post("", status_code=201, responses=problem_responses(404, 409), openapi_extra=_WITH_BODY)
 def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
-    """Register a marker of a family whose markers are points."""
+    """Register a marker as a feature.
+
+    Of a family whose markers are points.
+    """
     given = {name: value for name, value in _properties(feature).items() if value is not None}
     body = {name: given[name] for name in _PLAIN if name in given}
     surveyed = {name: given[name] for name in _SURVEYED if name in given}
@@ -141,8 +159,12 @@ def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
     return Response(status_code=201, headers={"Location": where, **_warned(made)})
 
 
+@router.put("/{feature}", status_code=204, responses=problem_responses(404, 409, 412), openapi_extra=_WITH_BODY)
 def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
-    """Replace a marker: what is left out is cleared, but for what a marker always has."""
+    """Replace a marker by a feature.
+
+    What is left out is cleared, but for what a marker always has.
+    """
     stored = edit.features.get(edit.caller, edit.collection, feature_id)
     given = {**dict.fromkeys((*_CLEARED, *_SURVEYED)), **_properties(feature)}
     place = _place(feature.get("geometry"), edit.crs)
@@ -156,11 +178,13 @@ def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentV
     return _change({"properties": given, "geometry": feature["geometry"]}, edit, feature_id, version)
 
 
+@router.patch("/{feature}", status_code=204, responses=problem_responses(404, 409, 412), openapi_extra=_WITH_BODY)
 def patch_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Change properties or the position of a marker."""
     return _change(feature, edit, feature_id, version)
 
 
+@router.delete("/{feature}", status_code=204, responses=problem_responses(404, 409, 412))
 def delete_feature(edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Retire a marker."""
     edit.features.get(edit.caller, edit.collection, feature_id)

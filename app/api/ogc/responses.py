@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
 import re
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Annotated, Literal, NotRequired
+from functools import partial, wraps
+from typing import Annotated, Any, Literal, NotRequired, ParamSpec
 from urllib.parse import urlencode
 
 import orjson
@@ -18,11 +24,14 @@ from starlette.responses import Response
 from typing_extensions import TypedDict
 
 from app.api.http.dependencies import use_case
+from app.api.http.limits import watch_client
+from app.api.http.problems import Described, problem_responses, reference
 from app.api.ogc.query import (
     OF_ITEM,
     ONLY_FORMAT,
     ItemsQuery,
     crs_parameter,
+    described,
     items_query,
     known_parameters,
     query_pairs,
@@ -30,10 +39,12 @@ from app.api.ogc.query import (
 )
 from app.errors import InvalidParameter
 from app.services.markers.features import Collection, FeatureCrs, Features, get_collection, no_feature
+from app.services.request_work import counted
 
 # === What the API returns under /ogc, typed (OGC 17-069r4, 18-058r1, 20-057; GeoJSON: RFC 7946).
 
 
+Asked = ParamSpec("Asked")
 JsonObject = dict[str, JsonValue]
 
 
@@ -314,6 +325,52 @@ def answer(
     if crs is not None:
         sent["Content-Crs"] = f"<{crs}>"
     return Response(orjson.dumps(content, option=_OPTIONS), status, sent, media_type=kind)
+
+
+# === How routes under /ogc are described, and the threads of the costly ones.
+
+
+_THREADS = ThreadPoolExecutor(max(2, min(os.cpu_count() or 1, 4)), "ogc")
+"""For pages and tiles: more threads would only wait for each other, and each for a connection."""
+
+
+class ReadDescription(TypedDict):
+    """Arguments of a route that reads."""
+
+    responses: Described
+    openapi_extra: dict[str, Any]
+
+
+def describe_read(
+    model: Any, media_type: str = JSON, *, html: bool = True, parameters: tuple[str, ...] = ONLY_FORMAT
+) -> ReadDescription:
+    """Describe a route that returns a document, unless it has no `html` as a page, too.
+
+    Parameters
+    ----------
+    parameters : tuple of str
+        Names of its query parameters.
+    """
+    is_open = model is JsonObject
+    schema = {"type": "object", "additionalProperties": True} if is_open else reference(model, "serialization")
+    content = {media_type: {"schema": schema}, **({HTML: {"schema": {"type": "string"}}} if html else {})}
+    formats = ("json", "html") if html else ("json",)
+    return {
+        "responses": {200: {"description": "OK", "content": content}, **problem_responses(404, 406)},
+        "openapi_extra": {"parameters": [described(name, formats) for name in parameters]},
+    }
+
+
+def in_own_threads(endpoint: Callable[Asked, Response]) -> Callable[Asked, Coroutine[Any, Any, Response]]:
+    """An endpoint that runs in the threads for pages and tiles."""
+
+    @wraps(endpoint)
+    async def run(*values: Asked.args, **named: Asked.kwargs) -> Response:
+        watch_client()
+        context, call = copy_context(), partial(endpoint, *values, **named)
+        return await asyncio.get_running_loop().run_in_executor(_THREADS, lambda: context.run(counted, call))
+
+    return run
 
 
 # === What the routes of /ogc ask for, as FastAPI dependencies: the collection, the feature, the query, the base URL.

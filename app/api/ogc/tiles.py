@@ -6,11 +6,14 @@ import math
 import re
 from typing import Annotated, Any, NotRequired, TypedDict
 
-from fastapi import Depends, Path, Request
+from fastapi import APIRouter, Depends, Path, Request
 from starlette.responses import Response
 
 from app.api.http.dependencies import Caller
-from app.api.ogc.query import OF_TILE, flag_parameter, known_parameters
+from app.api.http.problems import problem_responses
+from app.api.http.responses import file_response
+from app.api.http.strict_json import StrictRoute
+from app.api.ogc.query import OF_TILE, described, flag_parameter, known_parameters
 from app.api.ogc.responses import (
     JSON,
     MAP_STYLE,
@@ -18,6 +21,7 @@ from app.api.ogc.responses import (
     BaseUrl,
     CollectionOf,
     FeaturesService,
+    JsonObject,
     Offers,
     TileMatrix,
     TileMatrixSet,
@@ -25,6 +29,8 @@ from app.api.ogc.responses import (
     TileSet,
     TileSets,
     answer,
+    describe_read,
+    in_own_threads,
     link,
     negotiate,
 )
@@ -195,6 +201,7 @@ def _symbols(collection: Collection, looks: dict[str, str]) -> list[dict[str, An
 # === OGC API Tiles.
 
 
+router = APIRouter(prefix="/ogc", tags=["ogc"], route_class=StrictRoute)
 MATRIX_SET = "WebMercatorQuad"
 MATRIX_SET_URI = f"http://www.opengis.net/def/tilematrixset/OGC/1.0/{MATRIX_SET}"
 TILES_REL = "http://www.opengis.net/def/rel/ogc/1.0/tilesets-vector"
@@ -262,34 +269,12 @@ OffersJson = Annotated[bool, Depends(Offers(JSON))]
 OffersStyle = Annotated[bool, Depends(Offers(MAP_STYLE, JSON))]
 
 
-def list_tilesets(collection: Tiled, _offers: OffersJson, base: BaseUrl) -> Response:
-    """The tile sets of a collection: one."""
-    return answer(TileSets(tilesets=[_tileset(base, collection)]))
-
-
-def get_tileset(collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl) -> Response:
-    """A tile set of a collection."""
-    return answer(_tileset(base, collection))
-
-
-def get_tilejson(
-    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl, caller: Caller,
-    features: FeaturesService,
-) -> Response:  # fmt: skip
-    """A tile set of a collection as TileJSON 3.0."""
-    return answer(tilejson(collection, _template(base, collection), features.extent(caller, collection)))
-
-
-def get_map_style(
-    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersStyle, base: BaseUrl, caller: Caller,
-    features: FeaturesService,
-) -> Response:  # fmt: skip
-    """A MapLibre style of a tile set: symbols by family and status."""
-    sprite_url = f"{base.removesuffix('/ogc')}/static/sprites/markers"
-    extent = features.extent(caller, collection)
-    return answer(map_style(collection, _template(base, collection), sprite_url, extent), MAP_STYLE)
-
-
+@router.get(
+    "/collections/{collection}/tiles/{matrix_set}/{zoom}/{row}/{column}",
+    responses={**file_response([MVT]), 204: {"description": "No features"}, **problem_responses(404, 406)},
+    openapi_extra={"parameters": [described(name, ("mvt", "pbf")) for name in OF_TILE]},
+)
+@in_own_threads
 def get_tile(
     collection: Tiled,
     _matrix_set: MatrixSet,
@@ -298,7 +283,10 @@ def get_tile(
     caller: Caller,
     features: FeaturesService,
 ) -> Response:
-    """A tile; 204 without features."""
+    """Get a vector tile of a collection.
+
+    204 without features.
+    """
     content = (features.grouped_tile if groups else features.tile)(caller, collection, tile)
     headers = {"Cache-Control": "private, no-cache"}
     if not content:
@@ -306,14 +294,57 @@ def get_tile(
     return Response(content, headers=headers, media_type=MVT)
 
 
+@router.get("/collections/{collection}/tiles", **describe_read(TileSets, html=False))
+def list_tilesets(collection: Tiled, _offers: OffersJson, base: BaseUrl) -> Response:
+    """List the tile sets of a collection.
+
+    There is one.
+    """
+    return answer(TileSets(tilesets=[_tileset(base, collection)]))
+
+
+@router.get("/collections/{collection}/tiles/{matrix_set}", **describe_read(TileSet, html=False))
+def get_tileset(collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl) -> Response:
+    """Get a tile set of a collection."""
+    return answer(_tileset(base, collection))
+
+
+@router.get("/collections/{collection}/tiles/{matrix_set}/tilejson", **describe_read(JsonObject, html=False))
+def get_tilejson(
+    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl, caller: Caller,
+    features: FeaturesService,
+) -> Response:  # fmt: skip
+    """Get a tile set of a collection as TileJSON 3.0."""
+    return answer(tilejson(collection, _template(base, collection), features.extent(caller, collection)))
+
+
+@router.get("/collections/{collection}/tiles/{matrix_set}/style", **describe_read(JsonObject, MAP_STYLE, html=False))
+def get_map_style(
+    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersStyle, base: BaseUrl, caller: Caller,
+    features: FeaturesService,
+) -> Response:  # fmt: skip
+    """Get a MapLibre style of a tile set.
+
+    It has symbols by family and status.
+    """
+    sprite_url = f"{base.removesuffix('/ogc')}/static/sprites/markers"
+    extent = features.extent(caller, collection)
+    return answer(map_style(collection, _template(base, collection), sprite_url, extent), MAP_STYLE)
+
+
+@router.get("/tileMatrixSets", **describe_read(TileMatrixSets, html=False))
 def list_matrix_sets(_offers: OffersJson, base: BaseUrl) -> Response:
-    """The tile matrix sets: one."""
+    """List the tile matrix sets.
+
+    There is one.
+    """
     links = [link(f"{base}/tileMatrixSets/{MATRIX_SET}", "self", JSON)]
     return answer(TileMatrixSets(tileMatrixSets=[{"id": MATRIX_SET, "uri": MATRIX_SET_URI, "links": links}]))
 
 
+@router.get("/tileMatrixSets/{matrix_set}", **describe_read(TileMatrixSet, html=False))
 def get_matrix_set(_matrix_set: MatrixSet, _offers: OffersJson) -> Response:
-    """The tile matrix set, by its figures."""
+    """Get a tile matrix set."""
     matrices: list[TileMatrix] = [
         {
             "id": str(zoom),

@@ -112,7 +112,10 @@ def _check_length(declaration: bytes) -> None:
     responses=document_response(AlignmentDocument, 404, 409, 415, status=201, description="Stored"),
 )
 def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Caller, alignments: Service) -> Response:
-    """Store a road of a file or of the registry: its lanes with width, direction, curvature, grade and design speed."""
+    """Store an alignment of a file or of a registered road.
+
+    Its lanes have width, direction, curvature, grade and design speed.
+    """
     declared = upload.declared
     if isinstance(declared, RoadAlignmentIn):
         document, replayed = alignments.add_of_road(
@@ -129,7 +132,10 @@ def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Call
 def list_alignments(
     request: Request, caller: Caller, alignments: Service, limit: PageSize = 100, after: LastId = None
 ) -> Response:
-    """Alignments in the order they were made."""
+    """List the alignments of an agency.
+
+    In the order they were made.
+    """
     page, last = alignments.page(caller, after=after, limit=limit)
     return page_response(request, page, after=last)
 
@@ -138,7 +144,10 @@ def list_alignments(
 def get_alignment(
     alignment_id: AlignmentId, caller: Caller, alignments: Service, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """One alignment, with its version as ETag."""
+    """Get an alignment.
+
+    With its version as ETag.
+    """
     return versioned_response(alignments.get(caller, alignment_id), if_none_match)
 
 
@@ -147,7 +156,7 @@ def get_alignment(
     responses={**file_response(["application/octet-stream"], "The file as it came"), **problem_responses(404)},
 )
 def get_source(alignment_id: AlignmentId, caller: Caller, alignments: Service) -> Response:
-    """The file as it came."""
+    """Download the file of an alignment as it was uploaded."""
     data, _name = alignments.source(caller, alignment_id)
     return Response(data, media_type="application/octet-stream")
 
@@ -159,7 +168,10 @@ def get_profile(
     alignments: Service,
     samples: Annotated[int, Query(ge=2, le=MAX_SAMPLES, description="Of each lane at most.")] = 1000,
 ) -> Response:
-    """The lanes to draw: lines, stations, curvature, events and areas in which nothing is installed."""
+    """Get the lanes of an alignment to draw them.
+
+    Lines, stations, curvature, events and areas in which nothing is installed.
+    """
     return json_response(alignments.profile(caller, alignment_id, samples))
 
 
@@ -177,6 +189,9 @@ def get_map(
         float, Query(gt=0, le=MAX_WITHIN_M, allow_inf_nan=False, description="From the nearest lane's centre line.")
     ] = 20.0,
 ) -> Response:
-    """The lanes with the agency's markers near them, planned or on the road, as an HD map."""
+    """Download an alignment as an HD map.
+
+    The lanes with the agency's markers near them, planned or on the road.
+    """
     data = alignments.write_map(caller, alignment_id, form, filtered, within_m)
     return Response(data, media_type="application/xml")

@@ -67,13 +67,19 @@ _SCHEMA: dict[int | str, dict[str, Any]] = {
 
 @rule_router.get("/plan-rules/schema", responses={**_SCHEMA, **problem_responses()})
 def get_rules_schema(caller: Caller) -> Response:
-    """The JSON Schema of rules, for editors and forms."""
+    """Get the JSON Schema of rules.
+
+    For editors and forms.
+    """
     return Response(_schema(), media_type=SCHEMA_TYPE)
 
 
 @rule_router.post("/plan-rules", responses=document_response(ReadRules))
 def post_rules_text(wanted: RulesTextIn, caller: Caller) -> Response:
-    """Read and check rules of a file, YAML or JSON, and store nothing: for forms."""
+    """Read and check rules of a file.
+
+    YAML or JSON. Nothing is stored: this is for forms.
+    """
     rules = read_rules(wanted.text.encode())
     return json_response(ReadRules(rules=rules.model_dump(mode="json", exclude_unset=True, by_alias=True)))
 
@@ -87,7 +93,9 @@ def post_plan_preview(
     after: Annotated[int, Query(ge=0, le=10**7, description="Markers of the pages before.")] = 0,
     limit: Annotated[int, Query(ge=1, le=MAX_MARKERS)] = 1000,
 ) -> Response:
-    """Place and check what rules ask for on an alignment, and store nothing: to compare rules before a plan is made.
+    """Preview a plan without storing it.
+
+    Places and checks what rules ask for on an alignment, to compare rules before a plan is made.
 
     On at most 20 km of lanes. Markers have no codes. The counts are those of all markers; `markers` is a page of them,
     and a Link header names the next one, which is requested with the same body.
@@ -125,16 +133,22 @@ def list_plan_jobs(
     plan_id: Annotated[Identifier | None, Query(description="Jobs about this plan.")] = None,
     state: JobState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """Jobs about plans without their results, newest first."""
-    page, last = jobs.page(caller, plan_id=plan_id, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    """List jobs about plans.
+
+    Without their results, newest first.
+    """
+    page, last = jobs.page(caller, plan_id=plan_id, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @job_router.get("/{job_id}", responses=document_response(PlanJobDocument, 404))
 def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
-    """A job with its progress, or its result."""
+    """Get a job about a plan.
+
+    With its progress, or its result.
+    """
     document = jobs.get(caller, job_id)
     waiting = document["state"] in ("queued", "running")
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
@@ -142,7 +156,10 @@ def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
 
 @job_router.post("/{job_id}/cancel", responses=document_response(PlanJobDocument, 404))
 def cancel_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
-    """Ask a queued or running job to stop; a finished one stays as it is."""
+    """Cancel a job about a plan.
+
+    A finished one stays as it is.
+    """
     return json_response(jobs.cancel(caller, job_id))
 
 
@@ -174,7 +191,9 @@ def post_plan(
     idempotency: Idempotency,
     prefer: Prefer = None,
 ) -> Response:
-    """Place the markers that rules ask for on an alignment, and check them. Nothing is in the registry yet.
+    """Make a plan.
+
+    Places the markers that rules ask for on an alignment, and checks them. Nothing is in the registry yet.
 
     A plan on more than 20 km of lanes is made by a job, and so is one that is asked for with `Prefer: respond-async`.
     """
@@ -197,15 +216,19 @@ def list_plans(
     limit: PageSize = 100,
     after: LastId = None,
 ) -> Response:
-    """Plans in the order they were made, with their counts, verdicts and costs side by side."""
+    """List the plans of an agency.
+
+    In the order they were made, with their counts, verdicts and costs side by side.
+    """
     page, last = plans.page(caller, alignment_id=alignment_id, status=status, after=after, limit=limit)
     return page_response(request, page, after=last)
 
 
 @router.get("/{plan_id}", responses={**NOT_MODIFIED, **document_response(PlanDocument, 404)})
 def get_plan(plan_id: PlanId, caller: Caller, plans: Service, if_none_match: IfNoneMatch = None) -> Response:
-    """One plan with its findings, with its version as ETag. A committed one is always sent: its status follows from its
-    markers.
+    """Get a plan with its findings.
+
+    With its version as ETag. A committed one is always sent: its status follows from its markers.
     """
     plan = plans.get(caller, plan_id)
     return versioned_response(plan, None if plan["status"] in FOLLOWS_MARKERS else if_none_match)
@@ -213,7 +236,10 @@ def get_plan(plan_id: PlanId, caller: Caller, plans: Service, if_none_match: IfN
 
 @router.patch("/{plan_id}", responses=document_response(PlanDocument, 404, 409, 412, 428))
 def patch_plan(plan_id: PlanId, patch: PlanPatch, caller: Caller, plans: Service, version: Version) -> Response:
-    """Rename a plan, or place and check it again by other rules; its proof and its approval are then gone."""
+    """Rename a plan, or make it again by other rules.
+
+    Its proof and its approval are then gone.
+    """
     changed = plans.change(caller, plan_id, version, name=patch.name, rules=patch.rules, reason=patch.reason)
     return versioned_response(changed)
 
@@ -222,7 +248,10 @@ def patch_plan(plan_id: PlanId, patch: PlanPatch, caller: Caller, plans: Service
 def list_plan_versions(
     request: Request, plan_id: PlanId, caller: Caller, plans: Service, limit: PageSize = 100, after: AfterVersion = 0
 ) -> Response:
-    """The history of a plan, oldest first."""
+    """List the versions of a plan.
+
+    Oldest first.
+    """
     page, last = plans.history(caller, plan_id, after=after, limit=limit)
     return page_response(request, page, after=last)
 
@@ -240,7 +269,9 @@ def get_plan_file(
     crs: Annotated[Text | None, Query(max_length=64, description="CRS of the stakeout.")] = None,
     unit: Annotated[Literal["m", "ft-us", "ft-intl"] | None, Query(description="Unit of the stakeout.")] = None,
 ) -> Response:
-    """A file of a plan: its document, bill, stakeout, drawings, map, or the table of its proof.
+    """Download a file of a plan.
+
+    Its document, bill, stakeout, drawings, map, or the table of its proof.
 
     A wrong name is answered with the right ones.
     """
@@ -256,7 +287,10 @@ def get_plan_file(
 
 @router.post("/{plan_id}/approve", responses=document_response(PlanDocument, 404, 409, 412, 428))
 def approve_plan(plan_id: PlanId, caller: Caller, plans: Service, version: Version) -> Response:
-    """Approve a plan that the holder of another key made and whose checks passed."""
+    """Approve a plan.
+
+    One that the holder of another key made and whose checks passed.
+    """
     return versioned_response(plans.approve(caller, plan_id, version))
 
 
@@ -268,14 +302,20 @@ def approve_plan(plan_id: PlanId, caller: Caller, plans: Service, version: Versi
 def commit_plan(
     plan_id: PlanId, caller: Caller, plans: Service, version: Version, idempotency: Idempotency
 ) -> Response:
-    """Make the markers of an approved plan planned markers of the registry: all of them or none."""
+    """Commit a plan to the registry.
+
+    The markers of an approved plan become planned markers: all of them or none.
+    """
     document, replayed = plans.commit(caller, plan_id, version, idempotency)
     return created_response(document, replayed)
 
 
 @router.get("/{plan_id}/as-built", responses=document_response(AsBuiltDocument, 404))
 def get_as_built(plan_id: PlanId, caller: Caller, plans: Service) -> Response:
-    """A plan beside what was built and surveyed: residuals, tolerances, and what that does to the checks."""
+    """Compare a plan with what was built and surveyed.
+
+    Residuals, tolerances, and what that does to the checks.
+    """
     return json_response(plans.as_built(caller, plan_id))
 
 
@@ -297,7 +337,9 @@ PackageService = Annotated[Packages, use_case(lambda cases: cases.packages)]
 def post_package(
     plan_id: PlanId, wanted: PackageIn, caller: Caller, packages: PackageService, idempotency: Idempotency
 ) -> Response:
-    """Pack all files of a plan: drawings, stakeout, bill, maps, drilling sheets, artwork and a manifest with SHA-256.
+    """Pack all files of a plan.
+
+    Drawings, stakeout, bill, maps, drilling sheets, artwork and a manifest with SHA-256.
 
     Every plate is read back from its drawing first. The package replaces the plan's earlier one.
     """
@@ -312,7 +354,10 @@ def post_package(
 def get_package(
     plan_id: PlanId, caller: Caller, packages: PackageService, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """The package of a plan, as it was packed last; 404 if its markers were placed anew since."""
+    """Download the package of a plan.
+
+    As it was packed last; 404 if its markers were placed anew since.
+    """
     package = packages.open(caller, plan_id)
     headers = {"ETag": f'"{package.sha256}"'}
     if if_none_match == headers["ETag"]:
@@ -342,7 +387,9 @@ ProofService = Annotated[Proofs, use_case(lambda cases: cases.proofs)]
 def post_proof(
     plan_id: PlanId, terms: ProofIn, caller: Caller, proofs: ProofService, version: Version, idempotency: Idempotency
 ) -> Response:
-    """Prove a plan: simulated vehicles drive over it, and the real decoders read what they record.
+    """Prove a plan.
+
+    Simulated vehicles drive over it, and the real decoders read what they record.
 
     The same plan, terms and seed give the same report. A checked plan is `proved` if no reading was wrong; weak markers
     are listed and change nothing. The proof belongs to the markers as they are placed now: if other rules place them
@@ -353,7 +400,9 @@ def post_proof(
 
 @proof_router.get("/{plan_id}/proof", responses={**document_response(ProofDocument, 404), **problem_responses(404)})
 def get_proof(plan_id: PlanId, caller: Caller, proofs: ProofService) -> Response:
-    """The report of the latest proof: read rates, fixes, gaps, wrong readings, weak markers and their causes.
+    """Get the report of a plan's latest proof.
+
+    Read rates, fixes, gaps, wrong readings, weak markers and their causes.
 
     The table of its markers is the plan's file `proof.csv`.
     """

@@ -112,5 +112,8 @@ class RadioCheckIn(StrictModel):
 
 @router.post("", responses=document_response(RadioCheckDocument))
 def post_radio_check(wanted: RadioCheckIn, caller: Caller) -> Response:
-    """Check radios of CERPMs on a road: law, link, collisions, reading in time, battery. Nothing is stored."""
+    """Check the radios of CERPMs on a road.
+
+    Law, link, collisions, reading in time, battery. Nothing is stored.
+    """
     return json_response(check_plan(wanted.plan(), recommend=wanted.recommend))

@@ -62,48 +62,65 @@ def list_damage_reports(
     status: Annotated[ReportStatus | None, Query(description="Of the reports; without it, all.")] = None,
     marker_id: Annotated[Identifier | None, Query(description="Id of a marker.")] = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """Damage reports, newest first."""
-    page, last = reports.page(caller, state=status, marker_id=marker_id, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    """List the damage reports of an agency.
+
+    Newest first.
+    """
+    page, last = reports.page(caller, state=status, marker_id=marker_id, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @router.get("/{report_id}", responses=document_response(DamageReport, 404))
 def get_damage_report(report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """One damage report."""
+    """Get a damage report."""
     return json_response(reports.get(caller, report_id))
 
 
 @router.get("/{report_id}/photo", responses={**file_response(["image/jpeg"]), **problem_responses(404)})
 def get_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """The photo of a report: a JPEG that was written anew, without metadata."""
+    """Get the photo of a damage report.
+
+    A JPEG that was written anew, without metadata.
+    """
     return Response(reports.photo(caller, report_id), headers=_PHOTO_HEADERS, media_type="image/jpeg")
 
 
 @router.delete("/{report_id}/photo", status_code=204, responses=problem_responses(404))
 def delete_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """Delete the photo of a report, such as one that shows people. The report stays."""
+    """Delete the photo of a damage report.
+
+    Such as one that shows people. The report stays.
+    """
     reports.delete_photo(caller, report_id)
     return Response(status_code=204)
 
 
 @router.get("/{report_id}/contact", responses=document_response(ReportContact, 404))
 def get_report_contact(report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """The e-mail address that the sender of a report left for questions."""
+    """Get the e-mail address in a damage report.
+
+    Its sender left it for questions.
+    """
     return json_response(reports.contact(caller, report_id))
 
 
 @router.delete("/{report_id}/contact", status_code=204, responses=problem_responses(404))
 def delete_report_contact(report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """Delete the sender's e-mail address. The report stays."""
+    """Delete the e-mail address in a damage report.
+
+    The report stays.
+    """
     reports.delete_contact(caller, report_id)
     return Response(status_code=204)
 
 
 @router.post("/{report_id}/accept", responses=document_response(DamageReport, 404, 409))
 def accept_damage_report(acceptance: AcceptanceIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """Accept a report into the work list, `/v1/maintenance`: a new item, or the open one of the same marker.
+    """Accept a damage report into the work list.
+
+    In `/v1/maintenance` it is a new item, or the open one of the same marker.
 
     The marker does not change; that is decided with the item.
     """
@@ -112,7 +129,7 @@ def accept_damage_report(acceptance: AcceptanceIn, report_id: ReportId, caller: 
 
 @router.post("/{report_id}/reject", responses=document_response(DamageReport, 404, 409))
 def reject_damage_report(rejection: RejectionIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """Reject a report with a reason."""
+    """Reject a damage report with a reason."""
     return json_response(reports.reject(caller, report_id, rejection.reason))
 
 
@@ -144,11 +161,14 @@ class PublicPageIn(StrictModel):
 
 @settings_router.get("", responses={**NOT_MODIFIED, **document_response(PublicPageDocument)})
 def get_public_page_settings(caller: Caller, pages: Pages, if_none_match: IfNoneMatch = None) -> Response:
-    """What the agency releases of its markers on their public pages."""
+    """Get what an agency releases on its public pages."""
     return versioned_response(pages.settings(caller), if_none_match)
 
 
 @settings_router.put("", responses=document_response(PublicPageDocument, 412, 428))
 def put_public_page_settings(settings: PublicPageIn, caller: Caller, pages: Pages, version: Version) -> Response:
-    """Release other fields, or none. It holds at once, for the pages of all markers of the agency."""
+    """Change what an agency releases on its public pages.
+
+    Other fields, or none. It holds at once, for the pages of all its markers.
+    """
     return versioned_response(pages.change(caller, settings.fields, settings.damage_reports, version))

@@ -123,7 +123,9 @@ async def get_public_page(
     request: Request, marker_id: MarkerAddress, pages: Pages, tokens: Tokens, limits: Limits, form: Form,
     lang: Lang = None,
 ) -> Response:  # fmt: skip
-    """The public page of a marker: HTML, or JSON with `Accept: application/json`. It needs no key.
+    """Get the public page of a marker.
+
+    The public page of a marker: HTML, or JSON with `Accept: application/json`. It needs no key.
 
     It shows what the marker's agency releases. Where there is no such marker, or its agency releases nothing, the
     response is the same 404.
@@ -142,7 +144,7 @@ async def get_public_page(
 async def get_thanks(
     request: Request, marker_id: MarkerAddress, pages: Pages, limits: Limits, lang: Lang = None
 ) -> Response:
-    """The page after a damage report was received."""
+    """Get the page that confirms a damage report."""
     limits.take_page(request)
     texts = texts_for(request.scope)
     return page_response(thanks_page(texts, await _read(request, marker_id, pages, limits)), texts)
@@ -162,7 +164,9 @@ async def post_damage_report(
     request: Request, marker_id: MarkerAddress, pages: Pages, reports: Reports, tokens: Tokens, limits: Limits,
     form: Form, lang: Lang = None,
 ) -> Response:  # fmt: skip
-    """Report damage of a marker, without a key. Staff of the agency decides on it.
+    """Report damage of a marker, without a key.
+
+    Staff of the agency decides on it.
 
     A form is sent at the earliest three seconds and at the latest six hours after its token was made. One that is sent
     twice is one report.

@@ -117,11 +117,13 @@ Jobs = Annotated[ImportJobs, use_case(lambda cases: cases.import_jobs)]
     },
 )
 def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports, jobs: Jobs) -> Response:
-    """Import a survey: CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, KMZ, GPX, LandXML, JobXML, GSI or DXF.
+    """Import a survey.
+
+    CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, KMZ, GPX, LandXML, JobXML, GSI or DXF.
 
     With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
-    nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one that is
-    sent with `Prefer: respond-async`: 202, the report comes at Location.
+    nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one that is sent with
+    `Prefer: respond-async`: 202, the report comes at Location.
     """
     if asked.as_job:
         document, replayed = jobs.submit(caller, asked.declared, asked.given.file, asked.idempotency)
@@ -146,22 +148,30 @@ def list_imports(
     jobs: Jobs,
     state: JobState | None = None,
     limit: PageSize = 100,
-    before: LastId = None,
+    after: LastId = None,
 ) -> Response:
-    """Imports that are or were jobs, without their reports, newest first. Those that were answered at once are none."""
-    page, last = jobs.page(caller, state=state, before=before, limit=limit)
-    return page_response(request, page, before=last)
+    """List the imports of an agency that are or were jobs.
+
+    Without their reports, newest first. Those that were answered at once are none.
+    """
+    page, last = jobs.page(caller, state=state, before=after, limit=limit)
+    return page_response(request, page, after=last)
 
 
 @import_router.get("/{import_id}", responses=document_response(ImportJobDocument, 404))
 def get_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
-    """An import that was queued: its state, and its report once it is done. A refused one is done too."""
+    """Get an import that was queued.
+
+    Its state, and its report once it is done. A refused one is done too.
+    """
     return json_response(jobs.get(caller, import_id))
 
 
 @import_router.post("/{import_id}/cancel", responses=document_response(ImportJobDocument, 404, 409))
 def cancel_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
-    """Call an import off: a queued one never starts, a running one stops before it stores anything.
+    """Cancel an import.
+
+    A queued one never starts, a running one stops before it stores anything.
 
     409 where it is too late: it is storing already, or finished.
     """
@@ -226,7 +236,10 @@ def post_export(
     jobs: Annotated[ExportJobs, use_case(lambda cases: cases.export_jobs)],
     idempotency: Idempotency,
 ) -> Response:
-    """Write markers into a file as a job; the file is at its `links.result` for seven days."""
+    """Write markers into a file as a job.
+
+    The file is at its `links.result` for seven days.
+    """
     return queued_job(*jobs.submit(caller, wanted.wanted(), idempotency))
 
 
@@ -243,7 +256,9 @@ def get_export(
     exports: Exports,
     filtered: Filtered,
 ) -> Response:
-    """The markers of a filter, or all: CSV and GeoJSON as a stream, the others as one file.
+    """Download markers as a file.
+
+    The markers of a filter, or all: CSV and GeoJSON as a stream, the others as one file.
 
     The filters are those of GET /v1/markers.
 

@@ -78,6 +78,7 @@ class LineTagDocument(TypedDict):
 class MagnetDocument(MarkerDocument):
     """A magnet marker in a list; its position is that of the first magnet."""
 
+    family: Literal["magnet"]
     code: InformationTagDocument | LineTagDocument
     layout: TagPlaceDocument | LinePlaceDocument
 
@@ -165,6 +166,7 @@ def magnet_document(row: MarkerRow) -> MagnetDocument:
     spec: MagnetSpec = row.spec
     return {
         **marker_head(row),
+        "family": "magnet",
         "code": _tag_document(spec),
         "layout": spec["place"],
         **marker_place(row),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -101,6 +101,7 @@ class PlateReadingDocument(TypedDict):
     hundred.
     """
 
+    family: Literal["plate"]
     outcome: str
     reason: str | None
     certainty: str | None
@@ -272,6 +273,7 @@ def _reading_document(reading: PlateReading) -> PlateReadingDocument:
     code, likely, geometry, grade = reading.code, reading.likely_code, reading.geometry, reading.grade
     shown = code or likely
     return {
+        "family": "plate",
         "outcome": str(reading.outcome),
         "reason": reading.reason or None,
         "certainty": str(reading.certainty) if reading.certainty else None,

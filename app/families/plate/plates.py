@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import sqlalchemy as sa
 from typing_extensions import TypedDict
@@ -50,6 +50,7 @@ class PlateGeometryDocument(TypedDict):
 class PlateDocument(MarkerDocument):
     """A plate."""
 
+    family: Literal["plate"]
     code: PlateCodeDocument
     geometry: PlateGeometryDocument
 
@@ -59,6 +60,7 @@ def plate_document(row: MarkerRow) -> PlateDocument:
     n, unit_mm, gap_mm = row.n, row.unit_mm, row.gap_mm
     return {
         **marker_head(row),
+        "family": "plate",
         "code": {
             "scheme": row.scheme,
             "digits": row.digits,

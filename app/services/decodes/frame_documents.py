@@ -15,7 +15,7 @@ from typing_extensions import TypedDict
 from app import __version__
 from app.decoders.plate import DECODER_VERSION
 from app.errors import WaymarkError
-from app.families import get_family, union_of
+from app.families import get_family, union_of_documents
 from app.families.family import FrameReading, Match
 from app.families.plate.plates import PLATE
 from app.formats.images import ImageHeader
@@ -147,7 +147,6 @@ class ReadingPlace(TypedDict):
     """What every reading has besides what its family reads: its frame, its match and the vehicle's position by it."""
 
     frame: int
-    family: str
     match: MatchDocument | None
     fix: FixDocument | None
 
@@ -156,7 +155,7 @@ def _in_frame(document: Any) -> Any:
     return types.new_class(f"{document.__name__}InFrame", (ReadingPlace, document))
 
 
-AnyReading: Any = union_of(_in_frame(reader.document_type) for reader in FRAME_READERS.values())
+AnyReading: Any = union_of_documents(_in_frame(reader.document_type) for reader in FRAME_READERS.values())
 """One candidate marker of any family; digits only where the outcome is `read`."""
 
 
@@ -342,7 +341,6 @@ def _pose(pose: FramePose | None) -> FramePoseDocument | None:
 def _reading(marker: ReadMarker) -> dict[str, Any]:
     reading = marker.reading
     return {
-        "family": reading.family,
         **FRAME_READERS[reading.family].document(reading),
         "match": _match(marker.match),
         "fix": fix_document(marker.fix),

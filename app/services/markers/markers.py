@@ -14,7 +14,7 @@ from pydantic import JsonValue
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
-from app.families import FAMILIES, get_family, union_of
+from app.families import FAMILIES, get_family, union_of_documents
 from app.families.documents import MarkerDocument, PositionIn, WarningDocument, place_input, position_columns
 from app.families.family import Family, Registration
 from app.families.surveys import MarkerRules, NewMarker
@@ -68,9 +68,9 @@ if TYPE_CHECKING:
     AnyMarkerDetail = MarkerDocument
     AnyFoundMarker = FoundMarker
 else:
-    AnyMarker = union_of(family.document_type for family in FAMILIES)
-    AnyMarkerDetail = union_of(family.detail_type for family in FAMILIES)
-    AnyFoundMarker = union_of(_found(family.document_type) for family in FAMILIES)
+    AnyMarker = union_of_documents(family.document_type for family in FAMILIES)
+    AnyMarkerDetail = union_of_documents(family.detail_type for family in FAMILIES)
+    AnyFoundMarker = union_of_documents(_found(family.document_type) for family in FAMILIES)
 
 
 class MarkerPage(TypedDict):
@@ -472,7 +472,7 @@ def place_of(cursor: str) -> Place:
 def _bad_cursor() -> InvalidParameter:
     return InvalidParameter(
         "this is not where a page of observations ended",
-        field="before",
+        field="after",
         limit="as the link to the next page has it",
-        cure="start without before, and follow the links",
+        cure="start without after, and follow the links",
     )

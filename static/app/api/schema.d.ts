@@ -11,7 +11,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Health */
+        /** Check whether the process responds */
         get: operations["get_health"];
         put?: never;
         post?: never;
@@ -28,7 +28,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Public Page */
+        /** Get the public page of a marker */
         get: operations["get_public_page"];
         put?: never;
         post?: never;
@@ -47,7 +47,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Damage Report */
+        /** Report damage of a marker, without a key */
         post: operations["post_damage_report"];
         delete?: never;
         options?: never;
@@ -62,7 +62,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Thanks */
+        /** Get the page that confirms a damage report */
         get: operations["get_thanks"];
         put?: never;
         post?: never;
@@ -79,7 +79,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Metrics */
+        /** Get the server's metrics */
         get: operations["get_metrics"];
         put?: never;
         post?: never;
@@ -96,7 +96,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Landing Page */
+        /** Get the landing page */
         get: operations["landing_page"];
         put?: never;
         post?: never;
@@ -113,7 +113,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Landing Page With Slash */
+        /** Get the landing page */
         get: operations["landing_page_with_slash"];
         put?: never;
         post?: never;
@@ -130,7 +130,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Api */
+        /** Get the OpenAPI 3.0 document of the OGC API */
         get: operations["get_api"];
         put?: never;
         post?: never;
@@ -147,7 +147,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Collections */
+        /** List the collections */
         get: operations["list_collections"];
         put?: never;
         post?: never;
@@ -164,7 +164,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Collection */
+        /** Get a collection */
         get: operations["get_collection"];
         put?: never;
         post?: never;
@@ -181,7 +181,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Geojson Schema */
+        /** Get the schema of a collection's features in GeoJSON */
         get: operations["get_geojson_schema"];
         put?: never;
         post?: never;
@@ -198,13 +198,13 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Items */
+        /** List the features of a collection */
         get: operations["list_items"];
         put?: never;
-        /** Post Feature */
+        /** Register a marker as a feature */
         post: operations["post_feature"];
         delete?: never;
-        /** List Collection Methods */
+        /** List the methods that the caller may use on a collection */
         options: operations["list_collection_methods"];
         head?: never;
         patch?: never;
@@ -217,17 +217,17 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Item */
+        /** Get a feature */
         get: operations["get_item"];
-        /** Put Feature */
+        /** Replace a marker by a feature */
         put: operations["put_feature"];
         post?: never;
-        /** Delete Feature */
+        /** Retire a marker */
         delete: operations["delete_feature"];
-        /** List Feature Methods */
+        /** List the methods that the caller may use on a feature */
         options: operations["list_feature_methods"];
         head?: never;
-        /** Patch Feature */
+        /** Change properties or the position of a marker */
         patch: operations["patch_feature"];
         trace?: never;
     };
@@ -238,7 +238,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Queryables */
+        /** Get the properties that filters of a collection can use */
         get: operations["get_queryables"];
         put?: never;
         post?: never;
@@ -255,7 +255,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Schema */
+        /** Get the schema of a collection's properties */
         get: operations["get_schema"];
         put?: never;
         post?: never;
@@ -272,7 +272,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Tilesets */
+        /** List the tile sets of a collection */
         get: operations["list_tilesets"];
         put?: never;
         post?: never;
@@ -289,7 +289,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Tileset */
+        /** Get a tile set of a collection */
         get: operations["get_tileset"];
         put?: never;
         post?: never;
@@ -306,7 +306,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Tile */
+        /** Get a vector tile of a collection */
         get: operations["get_tile"];
         put?: never;
         post?: never;
@@ -323,7 +323,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Map Style */
+        /** Get a MapLibre style of a tile set */
         get: operations["get_map_style"];
         put?: never;
         post?: never;
@@ -340,7 +340,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Tilejson */
+        /** Get a tile set of a collection as TileJSON 3.0 */
         get: operations["get_tilejson"];
         put?: never;
         post?: never;
@@ -357,7 +357,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Conformance */
+        /** List the conformance classes */
         get: operations["get_conformance"];
         put?: never;
         post?: never;
@@ -374,7 +374,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Matrix Sets */
+        /** List the tile matrix sets */
         get: operations["list_matrix_sets"];
         put?: never;
         post?: never;
@@ -391,7 +391,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Matrix Set */
+        /** Get a tile matrix set */
         get: operations["get_matrix_set"];
         put?: never;
         post?: never;
@@ -408,7 +408,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Readiness */
+        /** Check whether every part that requests need is ready */
         get: operations["get_readiness"];
         put?: never;
         post?: never;
@@ -425,10 +425,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Agencies */
+        /** List the agencies of this server */
         get: operations["list_agencies"];
         put?: never;
-        /** Post Agency */
+        /** Create an agency with an admin key */
         post: operations["post_agency"];
         delete?: never;
         options?: never;
@@ -443,10 +443,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Alignments */
+        /** List the alignments of an agency */
         get: operations["list_alignments"];
         put?: never;
-        /** Post Alignment */
+        /** Store an alignment of a file or of a registered road */
         post: operations["post_alignment"];
         delete?: never;
         options?: never;
@@ -461,7 +461,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Alignment */
+        /** Get an alignment */
         get: operations["get_alignment"];
         put?: never;
         post?: never;
@@ -478,7 +478,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Map */
+        /** Download an alignment as an HD map */
         get: operations["get_map"];
         put?: never;
         post?: never;
@@ -495,7 +495,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Profile */
+        /** Get the lanes of an alignment to draw them */
         get: operations["get_profile"];
         put?: never;
         post?: never;
@@ -512,7 +512,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Source */
+        /** Download the file of an alignment as it was uploaded */
         get: operations["get_source"];
         put?: never;
         post?: never;
@@ -531,7 +531,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Artwork */
+        /** Make the artwork of several markers */
         post: operations["post_artwork"];
         delete?: never;
         options?: never;
@@ -546,7 +546,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Audit Entries */
+        /** List the entries of the audit log */
         get: operations["list_audit_entries"];
         put?: never;
         post?: never;
@@ -565,7 +565,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Verification */
+        /** Verify the audit log */
         post: operations["post_verification"];
         delete?: never;
         options?: never;
@@ -580,7 +580,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Verification */
+        /** Get a verification of the audit log */
         get: operations["get_verification"];
         put?: never;
         post?: never;
@@ -597,7 +597,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Board */
+        /** Download a calibration board at true size */
         get: operations["get_board"];
         put?: never;
         post?: never;
@@ -614,10 +614,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Calibrations */
+        /** List the calibrations of an agency */
         get: operations["list_calibrations"];
         put?: never;
-        /** Post Calibration */
+        /** Calibrate a camera from photos of a board */
         post: operations["post_calibration"];
         delete?: never;
         options?: never;
@@ -632,7 +632,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Calibration */
+        /** Get a calibration */
         get: operations["get_calibration"];
         put?: never;
         post?: never;
@@ -651,7 +651,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Codebook Draft */
+        /** Count the codes of a design of a codebook */
         post: operations["post_codebook_draft"];
         delete?: never;
         options?: never;
@@ -666,10 +666,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Codebooks */
+        /** List the codebooks of an agency */
         get: operations["list_codebooks"];
         put?: never;
-        /** Post Codebook */
+        /** Make a codebook */
         post: operations["post_codebook"];
         delete?: never;
         options?: never;
@@ -684,7 +684,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Codebook */
+        /** Get a codebook with its entries */
         get: operations["get_codebook"];
         put?: never;
         post?: never;
@@ -701,10 +701,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Entries */
+        /** List the entries of a codebook */
         get: operations["list_entries"];
         put?: never;
-        /** Post Entries */
+        /** Add meanings to a codebook */
         post: operations["post_entries"];
         delete?: never;
         options?: never;
@@ -719,7 +719,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Entry */
+        /** Get what a code of a codebook means */
         get: operations["get_entry"];
         put?: never;
         post?: never;
@@ -736,7 +736,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Damage Reports */
+        /** List the damage reports of an agency */
         get: operations["list_damage_reports"];
         put?: never;
         post?: never;
@@ -753,7 +753,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Damage Report */
+        /** Get a damage report */
         get: operations["get_damage_report"];
         put?: never;
         post?: never;
@@ -772,7 +772,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Accept Damage Report */
+        /** Accept a damage report into the work list */
         post: operations["accept_damage_report"];
         delete?: never;
         options?: never;
@@ -787,11 +787,11 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Report Contact */
+        /** Get the e-mail address in a damage report */
         get: operations["get_report_contact"];
         put?: never;
         post?: never;
-        /** Delete Report Contact */
+        /** Delete the e-mail address in a damage report */
         delete: operations["delete_report_contact"];
         options?: never;
         head?: never;
@@ -805,11 +805,11 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Damage Photo */
+        /** Get the photo of a damage report */
         get: operations["get_damage_photo"];
         put?: never;
         post?: never;
-        /** Delete Damage Photo */
+        /** Delete the photo of a damage report */
         delete: operations["delete_damage_photo"];
         options?: never;
         head?: never;
@@ -825,7 +825,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Reject Damage Report */
+        /** Reject a damage report with a reason */
         post: operations["reject_damage_report"];
         delete?: never;
         options?: never;
@@ -840,10 +840,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Decodes */
+        /** List the decodes of an agency */
         get: operations["list_decodes"];
         put?: never;
-        /** Post Decode */
+        /** Decode an upload of a vehicle */
         post: operations["post_decode"];
         delete?: never;
         options?: never;
@@ -858,7 +858,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Decode */
+        /** Get a decode */
         get: operations["get_decode"];
         put?: never;
         post?: never;
@@ -868,14 +868,14 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/decodes/{decode_id}/annotated.{suffix}": {
+    "/v1/decodes/{decode_id}/annotated.{form}": {
         parameters: {
             query?: never;
             header?: never;
             path?: never;
             cookie?: never;
         };
-        /** Get Annotated */
+        /** Get a frame with its readings drawn on it */
         get: operations["get_annotated"];
         put?: never;
         post?: never;
@@ -894,7 +894,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Cancel Decode */
+        /** Cancel a decode */
         post: operations["cancel_decode"];
         delete?: never;
         options?: never;
@@ -909,7 +909,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Lane */
+        /** Get the lane that a packet log gave */
         get: operations["get_lane"];
         put?: never;
         post?: never;
@@ -919,14 +919,14 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/decodes/{decode_id}/overlay.{suffix}": {
+    "/v1/decodes/{decode_id}/overlay.{form}": {
         parameters: {
             query?: never;
             header?: never;
             path?: never;
             cookie?: never;
         };
-        /** Get Overlay */
+        /** Get the camera frame of a packet log with the lane */
         get: operations["get_overlay"];
         put?: never;
         post?: never;
@@ -943,7 +943,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Packets */
+        /** Get the packets of a log */
         get: operations["get_packets"];
         put?: never;
         post?: never;
@@ -960,7 +960,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Plot */
+        /** Get the plot of a decode */
         get: operations["get_plot"];
         put?: never;
         post?: never;
@@ -977,7 +977,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Readings */
+        /** Download the readings of a decode */
         get: operations["get_readings"];
         put?: never;
         post?: never;
@@ -994,7 +994,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Samples */
+        /** Get the samples of a trace to plot them */
         get: operations["get_samples"];
         put?: never;
         post?: never;
@@ -1011,7 +1011,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Decode Track */
+        /** Download the vehicle's track by one decode */
         get: operations["get_decode_track"];
         put?: never;
         post?: never;
@@ -1028,7 +1028,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Decode Versions */
+        /** List the earlier results of a decode */
         get: operations["list_decode_versions"];
         put?: never;
         post?: never;
@@ -1045,10 +1045,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Drives */
+        /** List the drives of an agency */
         get: operations["list_drives"];
         put?: never;
-        /** Post Drive */
+        /** Fuse decodes of one drive into one track */
         post: operations["post_drive"];
         delete?: never;
         options?: never;
@@ -1063,11 +1063,11 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Drive */
+        /** Get a drive */
         get: operations["get_drive"];
         put?: never;
         post?: never;
-        /** Delete Drive */
+        /** Delete a finished drive with its track */
         delete: operations["delete_drive"];
         options?: never;
         head?: never;
@@ -1083,7 +1083,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Cancel Drive */
+        /** Cancel a drive */
         post: operations["cancel_drive"];
         delete?: never;
         options?: never;
@@ -1098,7 +1098,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Track Plot */
+        /** Get the plot of a drive's track */
         get: operations["get_track_plot"];
         put?: never;
         post?: never;
@@ -1115,7 +1115,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Track */
+        /** Download the track of a drive */
         get: operations["get_track"];
         put?: never;
         post?: never;
@@ -1132,7 +1132,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Events */
+        /** List or follow the events of an agency */
         get: operations["get_events"];
         put?: never;
         post?: never;
@@ -1151,7 +1151,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Export */
+        /** Write markers into a file as a job */
         post: operations["post_export"];
         delete?: never;
         options?: never;
@@ -1166,7 +1166,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Export */
+        /** Download markers as a file */
         get: operations["get_export"];
         put?: never;
         post?: never;
@@ -1183,10 +1183,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Imports */
+        /** List the imports of an agency that are or were jobs */
         get: operations["list_imports"];
         put?: never;
-        /** Post Import */
+        /** Import a survey */
         post: operations["post_import"];
         delete?: never;
         options?: never;
@@ -1201,7 +1201,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Import */
+        /** Get an import that was queued */
         get: operations["get_import"];
         put?: never;
         post?: never;
@@ -1220,7 +1220,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Cancel Import */
+        /** Cancel an import */
         post: operations["cancel_import"];
         delete?: never;
         options?: never;
@@ -1235,7 +1235,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Jobs */
+        /** List the jobs of an agency */
         get: operations["list_jobs"];
         put?: never;
         post?: never;
@@ -1252,7 +1252,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Job */
+        /** Get a job with its progress */
         get: operations["get_job"];
         put?: never;
         post?: never;
@@ -1271,7 +1271,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Cancel Job */
+        /** Cancel a job */
         post: operations["cancel_job"];
         delete?: never;
         options?: never;
@@ -1286,7 +1286,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Job Events */
+        /** Follow the progress of a job */
         get: operations["get_job_events"];
         put?: never;
         post?: never;
@@ -1303,7 +1303,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Job Result */
+        /** Download the file of a job */
         get: operations["get_job_result"];
         put?: never;
         post?: never;
@@ -1320,10 +1320,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Keys */
+        /** List the keys of an agency */
         get: operations["list_keys"];
         put?: never;
-        /** Post Key */
+        /** Create a key */
         post: operations["post_key"];
         delete?: never;
         options?: never;
@@ -1338,11 +1338,11 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Key */
+        /** Get a key */
         get: operations["get_key"];
         put?: never;
         post?: never;
-        /** Revoke Key */
+        /** End a key now */
         delete: operations["revoke_key"];
         options?: never;
         head?: never;
@@ -1358,7 +1358,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Rotate Key */
+        /** Replace a key by a new one */
         post: operations["rotate_key"];
         delete?: never;
         options?: never;
@@ -1373,7 +1373,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Maintenance */
+        /** List the work list of suspected faults */
         get: operations["list_maintenance"];
         put?: never;
         post?: never;
@@ -1390,7 +1390,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Maintenance File */
+        /** Download the work list as GeoJSON or as a table */
         get: operations["get_maintenance_file"];
         put?: never;
         post?: never;
@@ -1407,7 +1407,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Maintenance Item */
+        /** Get an item of the work list */
         get: operations["get_maintenance_item"];
         put?: never;
         post?: never;
@@ -1426,7 +1426,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Approve Maintenance Item */
+        /** Accept an item of the work list */
         post: operations["approve_maintenance_item"];
         delete?: never;
         options?: never;
@@ -1443,7 +1443,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Dismiss Maintenance Item */
+        /** Reject an item of the work list */
         post: operations["dismiss_maintenance_item"];
         delete?: never;
         options?: never;
@@ -1458,10 +1458,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Markers */
+        /** List the markers of an agency */
         get: operations["list_markers"];
         put?: never;
-        /** Post Marker */
+        /** Register a marker of any family */
         post: operations["post_marker"];
         delete?: never;
         options?: never;
@@ -1476,14 +1476,14 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Marker */
+        /** Get a marker */
         get: operations["get_marker"];
         put?: never;
         post?: never;
         delete?: never;
         options?: never;
         head?: never;
-        /** Patch Marker */
+        /** Change a marker */
         patch: operations["patch_marker"];
         trace?: never;
     };
@@ -1494,7 +1494,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Marker Accuracy */
+        /** Get the accuracy of a marker's survey */
         get: operations["get_marker_accuracy"];
         put?: never;
         post?: never;
@@ -1511,7 +1511,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Artwork */
+        /** Download the artwork of a marker at true size */
         get: operations["get_artwork"];
         put?: never;
         post?: never;
@@ -1528,7 +1528,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Marker Health */
+        /** Get the health of a marker */
         get: operations["get_marker_health"];
         put?: never;
         post?: never;
@@ -1545,7 +1545,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Layout */
+        /** Download the drilling sheet of a magnet marker */
         get: operations["get_layout"];
         put?: never;
         post?: never;
@@ -1562,7 +1562,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Marker Observations */
+        /** List the observations of a marker */
         get: operations["list_marker_observations"];
         put?: never;
         post?: never;
@@ -1579,7 +1579,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Observation Summary */
+        /** Summarise the observations of a marker */
         get: operations["get_observation_summary"];
         put?: never;
         post?: never;
@@ -1596,7 +1596,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Payload */
+        /** Download the message that a CERPM sends */
         get: operations["get_payload"];
         put?: never;
         post?: never;
@@ -1613,7 +1613,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Marker Versions */
+        /** List the versions of a marker */
         get: operations["list_marker_versions"];
         put?: never;
         post?: never;
@@ -1630,7 +1630,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Marker Version */
+        /** Get a version of a marker */
         get: operations["get_marker_version"];
         put?: never;
         post?: never;
@@ -1649,7 +1649,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Bulk */
+        /** Register and change up to 1000 markers in one transaction */
         post: operations["post_bulk"];
         delete?: never;
         options?: never;
@@ -1666,7 +1666,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Search Markers */
+        /** Search markers by a polygon or a corridor */
         post: operations["search_markers"];
         delete?: never;
         options?: never;
@@ -1681,7 +1681,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Me */
+        /** Get the holder of the key or token of this request */
         get: operations["get_me"];
         put?: never;
         post?: never;
@@ -1698,7 +1698,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Page Settings */
+        /** Get the settings of the web pages */
         get: operations["get_page_settings"];
         put?: never;
         post?: never;
@@ -1715,7 +1715,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Plan Jobs */
+        /** List jobs about plans */
         get: operations["list_plan_jobs"];
         put?: never;
         post?: never;
@@ -1732,7 +1732,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Plan Job */
+        /** Get a job about a plan */
         get: operations["get_plan_job"];
         put?: never;
         post?: never;
@@ -1751,7 +1751,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Cancel Plan Job */
+        /** Cancel a job about a plan */
         post: operations["cancel_plan_job"];
         delete?: never;
         options?: never;
@@ -1768,7 +1768,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Plan Preview */
+        /** Preview a plan without storing it */
         post: operations["post_plan_preview"];
         delete?: never;
         options?: never;
@@ -1785,7 +1785,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Rules Text */
+        /** Read and check rules of a file */
         post: operations["post_rules_text"];
         delete?: never;
         options?: never;
@@ -1800,7 +1800,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Rules Schema */
+        /** Get the JSON Schema of rules */
         get: operations["get_rules_schema"];
         put?: never;
         post?: never;
@@ -1817,10 +1817,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Plans */
+        /** List the plans of an agency */
         get: operations["list_plans"];
         put?: never;
-        /** Post Plan */
+        /** Make a plan */
         post: operations["post_plan"];
         delete?: never;
         options?: never;
@@ -1835,14 +1835,14 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Plan */
+        /** Get a plan with its findings */
         get: operations["get_plan"];
         put?: never;
         post?: never;
         delete?: never;
         options?: never;
         head?: never;
-        /** Patch Plan */
+        /** Rename a plan, or make it again by other rules */
         patch: operations["patch_plan"];
         trace?: never;
     };
@@ -1855,7 +1855,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Approve Plan */
+        /** Approve a plan */
         post: operations["approve_plan"];
         delete?: never;
         options?: never;
@@ -1870,7 +1870,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get As Built */
+        /** Compare a plan with what was built and surveyed */
         get: operations["get_as_built"];
         put?: never;
         post?: never;
@@ -1889,7 +1889,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Commit Plan */
+        /** Commit a plan to the registry */
         post: operations["commit_plan"];
         delete?: never;
         options?: never;
@@ -1904,7 +1904,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Plan File */
+        /** Download a file of a plan */
         get: operations["get_plan_file"];
         put?: never;
         post?: never;
@@ -1921,10 +1921,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Package */
+        /** Download the package of a plan */
         get: operations["get_package"];
         put?: never;
-        /** Post Package */
+        /** Pack all files of a plan */
         post: operations["post_package"];
         delete?: never;
         options?: never;
@@ -1939,10 +1939,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Proof */
+        /** Get the report of a plan's latest proof */
         get: operations["get_proof"];
         put?: never;
-        /** Post Proof */
+        /** Prove a plan */
         post: operations["post_proof"];
         delete?: never;
         options?: never;
@@ -1957,7 +1957,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Plan Versions */
+        /** List the versions of a plan */
         get: operations["list_plan_versions"];
         put?: never;
         post?: never;
@@ -1976,7 +1976,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Plate Draft */
+        /** Design a plate that is not registered */
         post: operations["post_plate_draft"];
         delete?: never;
         options?: never;
@@ -1993,7 +1993,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Draft Artwork */
+        /** Make the artwork of a plate that is not registered */
         post: operations["post_draft_artwork"];
         delete?: never;
         options?: never;
@@ -2010,7 +2010,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Camera Pass */
+        /** Predict what a camera reads of a plate as it passes */
         post: operations["post_camera_pass"];
         delete?: never;
         options?: never;
@@ -2027,7 +2027,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Camera View */
+        /** Draw a plate as a camera sees it */
         post: operations["post_camera_view"];
         delete?: never;
         options?: never;
@@ -2044,7 +2044,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Print Grade */
+        /** Grade a printed plate by a photo */
         post: operations["post_print_grade"];
         delete?: never;
         options?: never;
@@ -2061,7 +2061,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Programs */
+        /** Make a table for programming several CERPMs */
         post: operations["post_programs"];
         delete?: never;
         options?: never;
@@ -2076,9 +2076,9 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Public Page Settings */
+        /** Get what an agency releases on its public pages */
         get: operations["get_public_page_settings"];
-        /** Put Public Page Settings */
+        /** Change what an agency releases on its public pages */
         put: operations["put_public_page_settings"];
         post?: never;
         delete?: never;
@@ -2096,7 +2096,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Radio Check */
+        /** Check the radios of CERPMs on a road */
         post: operations["post_radio_check"];
         delete?: never;
         options?: never;
@@ -2111,10 +2111,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Reprocessings */
+        /** List the reprocessings of an agency */
         get: operations["list_reprocessings"];
         put?: never;
-        /** Post Reprocessing */
+        /** Decode stored uploads again with the present decoders */
         post: operations["post_reprocessing"];
         delete?: never;
         options?: never;
@@ -2129,7 +2129,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Reprocessing */
+        /** Get a reprocessing */
         get: operations["get_reprocessing"];
         put?: never;
         post?: never;
@@ -2148,7 +2148,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Accept Reprocessing */
+        /** Accept the results of a reprocessing */
         post: operations["accept_reprocessing"];
         delete?: never;
         options?: never;
@@ -2165,7 +2165,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Cancel Reprocessing */
+        /** Cancel a reprocessing */
         post: operations["cancel_reprocessing"];
         delete?: never;
         options?: never;
@@ -2180,7 +2180,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Reprocessing Report */
+        /** Get the report of a reprocessing */
         get: operations["get_reprocessing_report"];
         put?: never;
         post?: never;
@@ -2197,7 +2197,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Reprocessing Csv */
+        /** Download the report of a reprocessing as CSV */
         get: operations["get_reprocessing_csv"];
         put?: never;
         post?: never;
@@ -2214,10 +2214,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Roads */
+        /** List the roads of an agency */
         get: operations["list_roads"];
         put?: never;
-        /** Post Road */
+        /** Register a road */
         post: operations["post_road"];
         delete?: never;
         options?: never;
@@ -2232,14 +2232,14 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Road */
+        /** Get a road */
         get: operations["get_road"];
         put?: never;
         post?: never;
         delete?: never;
         options?: never;
         head?: never;
-        /** Patch Road */
+        /** Change a road's axis or calibration */
         patch: operations["patch_road"];
         trace?: never;
     };
@@ -2250,10 +2250,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Locate On Road */
+        /** Convert a position to a measure on a road */
         get: operations["locate_on_road"];
         put?: never;
-        /** Locate Many On Road */
+        /** Convert up to 1000 positions to measures on a road */
         post: operations["locate_many_on_road"];
         delete?: never;
         options?: never;
@@ -2268,7 +2268,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Markers On Road */
+        /** List the markers on a road */
         get: operations["list_markers_on_road"];
         put?: never;
         post?: never;
@@ -2285,10 +2285,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Position On Road */
+        /** Convert a measure on a road to a position */
         get: operations["get_position_on_road"];
         put?: never;
-        /** Get Positions On Road */
+        /** Convert up to 1000 measures on a road to positions */
         post: operations["get_positions_on_road"];
         delete?: never;
         options?: never;
@@ -2303,7 +2303,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Road Versions */
+        /** List the versions of a road */
         get: operations["list_road_versions"];
         put?: never;
         post?: never;
@@ -2320,7 +2320,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Server Settings */
+        /** Get the settings that the server runs with */
         get: operations["get_server_settings"];
         put?: never;
         post?: never;
@@ -2337,7 +2337,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Snapshot */
+        /** Download a signed snapshot of an area */
         get: operations["get_snapshot"];
         put?: never;
         post?: never;
@@ -2354,7 +2354,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Trust */
+        /** Get the keys that snapshots are verified with */
         get: operations["get_trust"];
         put?: never;
         post?: never;
@@ -2373,10 +2373,10 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Post Upload */
+        /** Start an upload in parts */
         post: operations["post_upload"];
         delete?: never;
-        /** List Options */
+        /** List the version, extensions and limits of tus */
         options: operations["list_options"];
         head?: never;
         patch?: never;
@@ -2389,17 +2389,17 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Upload */
+        /** Get an upload */
         get: operations["get_upload"];
         put?: never;
         post?: never;
-        /** Delete Upload */
+        /** Give an upload up */
         delete: operations["delete_upload"];
-        /** List Upload Options */
+        /** List the version, extensions and limits of tus for an upload */
         options: operations["list_upload_options"];
-        /** Head Upload */
+        /** Get how far an upload is */
         head: operations["head_upload"];
-        /** Patch Upload */
+        /** Append a part to an upload */
         patch: operations["patch_upload"];
         trace?: never;
     };
@@ -2412,7 +2412,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Complete Upload */
+        /** Complete an upload whose parts were sent to S3 */
         post: operations["complete_upload"];
         delete?: never;
         options?: never;
@@ -2427,10 +2427,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Vehicles */
+        /** List the vehicles of an agency */
         get: operations["list_vehicles"];
         put?: never;
-        /** Post Vehicle */
+        /** Add a vehicle with its sensor profile */
         post: operations["post_vehicle"];
         delete?: never;
         options?: never;
@@ -2445,15 +2445,15 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Vehicle */
+        /** Get a vehicle */
         get: operations["get_vehicle"];
         put?: never;
         post?: never;
-        /** Delete Vehicle */
+        /** Retire a vehicle */
         delete: operations["delete_vehicle"];
         options?: never;
         head?: never;
-        /** Patch Vehicle */
+        /** Change a vehicle */
         patch: operations["patch_vehicle"];
         trace?: never;
     };
@@ -2465,7 +2465,7 @@ export interface paths {
             cookie?: never;
         };
         get?: never;
-        /** Put Calibration */
+        /** Put a calibration into a vehicle's camera */
         put: operations["put_calibration"];
         post?: never;
         delete?: never;
@@ -2482,10 +2482,10 @@ export interface paths {
             cookie?: never;
         };
         get?: never;
-        /** Put Vehicle Key */
+        /** Let a key speak for a vehicle */
         put: operations["put_vehicle_key"];
         post?: never;
-        /** Delete Vehicle Key */
+        /** Let a key speak for a vehicle no longer */
         delete: operations["delete_vehicle_key"];
         options?: never;
         head?: never;
@@ -2499,7 +2499,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Vehicle Versions */
+        /** List the versions of a vehicle */
         get: operations["list_vehicle_versions"];
         put?: never;
         post?: never;
@@ -2516,10 +2516,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Webhooks */
+        /** List the webhooks of an agency */
         get: operations["list_webhooks"];
         put?: never;
-        /** Post Webhook */
+        /** Register a webhook */
         post: operations["post_webhook"];
         delete?: never;
         options?: never;
@@ -2534,11 +2534,11 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** Get Webhook */
+        /** Get a webhook */
         get: operations["get_webhook"];
         put?: never;
         post?: never;
-        /** Delete Webhook */
+        /** Delete a webhook with its deliveries */
         delete: operations["delete_webhook"];
         options?: never;
         head?: never;
@@ -2552,7 +2552,7 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List Deliveries */
+        /** List the deliveries of a webhook */
         get: operations["list_deliveries"];
         put?: never;
         post?: never;
@@ -2571,7 +2571,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Redeliver */
+        /** Send a delivery of a webhook again */
         post: operations["redeliver"];
         delete?: never;
         options?: never;
@@ -2588,7 +2588,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Enable Webhook */
+        /** Enable a webhook again */
         post: operations["enable_webhook"];
         delete?: never;
         options?: never;
@@ -3038,7 +3038,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             dev_eui: string | null;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "cerpm";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -3943,7 +3947,11 @@ export interface components {
             code: components["schemas"]["FiducialCodeDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "fiducial";
             geometry: components["schemas"]["FiducialGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -4000,7 +4008,11 @@ export interface components {
             contrast: number;
             corners_px: number[][];
             digits: string | null;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "fiducial";
             fix: components["schemas"]["FixDocument"] | null;
             frame: number;
             match: components["schemas"]["MatchDocument"] | null;
@@ -4066,7 +4078,11 @@ export interface components {
             created_at: string;
             dev_eui: string | null;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "cerpm";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4091,7 +4107,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "fiducial";
             geometry: components["schemas"]["FiducialGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -4113,7 +4133,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "magnet";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4135,7 +4159,11 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             distance_m?: number;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "plate";
             geometry: components["schemas"]["PlateGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -4587,7 +4615,11 @@ export interface components {
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "magnet";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4613,7 +4645,11 @@ export interface components {
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "magnet";
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -5271,7 +5307,11 @@ export interface components {
             code: components["schemas"]["PlateCodeDocument"];
             /** Format: date-time */
             created_at: string;
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "plate";
             geometry: components["schemas"]["PlateGeometryDocument"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
@@ -5350,7 +5390,11 @@ export interface components {
             digits: string | null;
             doubtful_cells: number[];
             evidence_frames: number[];
-            family: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            family: "plate";
             fix: components["schemas"]["FixDocument"] | null;
             frame: number;
             from_codebook: boolean;
@@ -7899,8 +7943,7 @@ export interface operations {
         parameters: {
             query?: {
                 action?: string | null;
-                after?: number;
-                before?: number | null;
+                after?: number | null;
                 limit?: number;
                 order?: "oldest" | "newest";
                 since?: string | null;
@@ -8007,7 +8050,7 @@ export interface operations {
     list_calibrations: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
             };
             header?: never;
@@ -8260,7 +8303,7 @@ export interface operations {
     list_damage_reports: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 marker_id?: string | null;
                 status?: ("new" | "accepted" | "rejected") | null;
@@ -8441,7 +8484,7 @@ export interface operations {
     list_decodes: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 kind?: components["schemas"]["DecodeKind"] | null;
                 limit?: number;
                 since?: string | null;
@@ -8549,7 +8592,7 @@ export interface operations {
             };
             path: {
                 decode_id: string;
-                suffix: "png" | "jpg";
+                form: "png" | "jpg";
             };
             cookie?: never;
         };
@@ -8633,7 +8676,7 @@ export interface operations {
             };
             path: {
                 decode_id: string;
-                suffix: "png" | "jpg";
+                form: "png" | "jpg";
             };
             cookie?: never;
         };
@@ -8826,7 +8869,7 @@ export interface operations {
     list_drives: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
                 vehicle?: string | null;
@@ -9108,7 +9151,7 @@ export interface operations {
     list_imports: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
             };
@@ -9225,7 +9268,7 @@ export interface operations {
     list_jobs: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 dead_letter?: boolean | null;
                 kind?: components["schemas"]["JobKind"] | null;
                 limit?: number;
@@ -9882,7 +9925,7 @@ export interface operations {
     list_marker_observations: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 since?: string | null;
                 until?: string | null;
@@ -10100,7 +10143,7 @@ export interface operations {
     list_plan_jobs: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 plan_id?: string | null;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
@@ -11823,7 +11866,7 @@ export interface operations {
     list_deliveries: {
         parameters: {
             query?: {
-                before?: string | null;
+                after?: string | null;
                 limit?: number;
                 state?: ("waiting" | "delivered" | "failed") | null;
             };

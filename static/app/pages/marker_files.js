@@ -13,7 +13,9 @@ import { codeOf } from "../format.js";
 import { may } from "../session.js";
 import { t, textOr } from "../texts/index.js";
 
-/** @param {{ marker: any }} props */
+/** @typedef {import("../api/schema.js").components["schemas"]} Schemas */
+
+/** @param {{ marker: import("./markers_panel.js").MarkerDetail }} props */
 export function FilesOf({ marker }) {
   if (marker.family === "magnet") return html`<${Layout} marker=${marker} />`;
   if (marker.family === "cerpm") return html`<${Message} marker=${marker} />`;
@@ -29,7 +31,7 @@ function Downloads({ forms, label, path, name }) {
   `;
 }
 
-/** @param {{ marker: any }} props */
+/** @param {{ marker: Schemas["PlateDocument"] | Schemas["FiducialDocument"] }} props */
 function Artwork({ marker }) {
   const [proof, setProof] = useState("");
   const code = codeOf(marker);
@@ -41,9 +43,9 @@ function Artwork({ marker }) {
   `;
 }
 
-/** @param {{ marker: any }} props */
+/** @param {{ marker: Schemas["MagnetDetailDocument"] }} props */
 function Layout({ marker }) {
-  const places = marker.magnets.map((/** @type {any} */ magnet) => ({
+  const places = marker.magnets.map((magnet) => ({
     lon_deg: magnet.lon_deg, lat_deg: magnet.lat_deg, heading_deg: magnet.north_pole_bearing_deg,
     label: t("marker.magnet", { number: magnet.number, pole: magnet.north_pole }), kind: magnet.polarity === "N" ? "chosen" : "",
   }));
@@ -53,20 +55,20 @@ function Layout({ marker }) {
       name=${(/** @type {string} */ form) => `${marker.id}-r${marker.version}.${form}`} />
     <h4>${t("marker.checks")}</h4>
     <ul class="plain">
-      ${marker.checks.map((/** @type {any} */ check) => html`
+      ${marker.checks.map((check) => html`
         <li title=${`${check.note} (${check.source})`}><${Verdict} level=${check.passed ? "good" : "warn"}>${t(check.passed ? "marker.check_passed" : "marker.check_warning")}</${Verdict}> ${check.name}: ${check.figure} ${check.relation} ${check.limit} ${check.unit}</li>
       `)}
     </ul>
   `;
 }
 
-/** @param {{ marker: any }} props */
+/** @param {{ marker: Schemas["CerpmDocument"] }} props */
 function Message({ marker }) {
   if (!may("GET /v1/markers/{marker_id}/payload.{form}")) return html`<p class="hint">${t("marker.message_hidden")}</p>`;
   return html`<${VisibleMessage} marker=${marker} />`;
 }
 
-/** @param {{ marker: any }} props */
+/** @param {{ marker: Schemas["CerpmDocument"] }} props */
 function VisibleMessage({ marker }) {
   const payload = useLoad(async (signal) => (await request(`/v1/markers/${marker.id}/payload.json`, { signal })).json(), [marker.id, marker.version]);
   return html`

@@ -17,7 +17,8 @@ import { t, textOr } from "../texts/index.js";
 import { FilesOf } from "./marker_files.js";
 import { HealthOf } from "./marker_health.js";
 
-/** @typedef {any} MarkerDetail One of four families; what all have in common is typed in the schema. */
+/** @typedef {import("../api/schema.js").components["schemas"]} Schemas */
+/** @typedef {Schemas["PlateDocument"] | Schemas["MagnetDetailDocument"] | Schemas["CerpmDocument"] | Schemas["FiducialDocument"]} MarkerDetail */
 
 const EDITED = ["status", "road", "measure_m", "offset_m", "heading_deg", "position.lon_deg", "position.lat_deg", "position.height_m", "position.horizontal_rmse_m", "position.survey_method"];
 
@@ -56,20 +57,8 @@ export function MarkerPanel({ id, onClose, onChanged }) {
 
 /** @param {MarkerDetail} marker @returns {[string, any][]} */
 function factsOf(marker) {
-  const { code, geometry, radio, speed_limit: limit, layout } = marker;
-  const meaning = code.meaning?.text ?? null;
   return [
-    [t("field.scheme"), code.scheme && (code.registry_number === null || code.registry_number === undefined ? code.scheme : t("marker.scheme_number", { scheme: code.scheme, number: code.registry_number }))],
-    [t("marker.meaning"), meaning],
-    [t("marker.line_style"), code.style && textOr(`option.${code.style}`, code.style)],
-    [t("marker.size"), geometry?.side_mm && (geometry.n ? t("marker.size_units", { n: geometry.n, side: number(geometry.side_mm, 0) }) : number(geometry.side_mm, 0, "mm"))],
-    [t("marker.magnets"), marker.magnets && t("marker.magnets_text", { count: marker.magnets.length, length: number(marker.length_m, 2) })],
-    [t("marker.place_in_lane"), layout && (layout.chainage_m === undefined ? t("marker.chainage_range", { from: layout.from_m, to: layout.to_m ?? "…" }) : t("marker.chainage", { chainage: number(layout.chainage_m, 2), offset: number(layout.offset_m, 2) }))],
-    [t("marker.cost"), marker.bill && number(marker.bill.total_usd, 2, "USD")],
-    [t("field.side"), marker.side && textOr(`option.${marker.side}`, marker.side)],
-    [t("marker.speed_limit"), limit && `${limit.value} ${limit.unit}`],
-    [t("marker.transmission"), radio && t("marker.transmission_text", { interval: radio.interval_s, sf: radio.spreading_factor, khz: radio.bandwidth_hz / 1000, mhz: radio.frequency_hz / 1e6 })],
-    ["DevEUI", marker.dev_eui],
+    ...factsOfFamily(marker),
     [t("field.road"), marker.road],
     [t("field.measure_m"), marker.measure_m === null ? null : number(marker.measure_m, 2)],
     [t("field.offset_m"), marker.offset_m === null ? null : number(marker.offset_m, 2)],
@@ -77,6 +66,36 @@ function factsOf(marker) {
     [t("field.position"), `${degrees(marker.position.lon_deg)}, ${degrees(marker.position.lat_deg)}`],
     [t("field.grade"), textOr(`grade.${marker.position.localization_grade}`, marker.position.localization_grade)],
     [t("field.id"), html`<span class="code small">${marker.id}</span>`],
+  ];
+}
+
+/** @param {MarkerDetail} marker @returns {[string, any][]} */
+function factsOfFamily(marker) {
+  if (marker.family === "plate") {
+    const { code, geometry } = marker;
+    return [
+      [t("field.scheme"), code.registry_number === null ? code.scheme : t("marker.scheme_number", { scheme: code.scheme, number: code.registry_number })],
+      [t("marker.size"), t("marker.size_units", { n: geometry.n, side: number(geometry.side_mm, 0) })],
+    ];
+  }
+  if (marker.family === "fiducial") return [[t("field.scheme"), marker.code.scheme], [t("marker.size"), number(marker.geometry.side_mm, 0, "mm")]];
+  if (marker.family === "cerpm") {
+    const { code, side, speed_limit: limit, radio, dev_eui } = marker;
+    return [
+      [t("field.scheme"), code.scheme],
+      [t("field.side"), side && textOr(`option.${side}`, side)],
+      [t("marker.speed_limit"), limit && `${limit.value} ${limit.unit}`],
+      [t("marker.transmission"), radio && t("marker.transmission_text", { interval: radio.interval_s, sf: radio.spreading_factor, khz: radio.bandwidth_hz / 1000, mhz: radio.frequency_hz / 1e6 })],
+      ["DevEUI", dev_eui],
+    ];
+  }
+  const { code, layout } = marker;
+  return [
+    [t("field.scheme"), code.scheme],
+    code.scheme === "line-tag" ? [t("marker.line_style"), textOr(`option.${code.style}`, code.style)] : [t("marker.meaning"), code.meaning?.text],
+    [t("marker.magnets"), t("marker.magnets_text", { count: marker.magnets.length, length: number(marker.length_m, 2) })],
+    [t("marker.place_in_lane"), "chainage_m" in layout ? t("marker.chainage", { chainage: number(layout.chainage_m, 2), offset: number(layout.offset_m, 2) }) : t("marker.chainage_range", { from: layout.from_m, to: layout.to_m ?? "…" })],
+    [t("marker.cost"), number(marker.bill.total_usd, 2, "USD")],
   ];
 }
 
@@ -166,7 +185,7 @@ function EditDialog({ marker, onClose, onChanged }) {
 /** @param {{ schema: any, marker: MarkerDetail, onClose: () => void, onChanged: () => void }} props */
 function EditForm({ schema, marker, onClose, onChanged }) {
   const start = Object.fromEntries(EDITED.map((path) => {
-    const value = path.split(".").reduce((place, part) => place?.[part], marker);
+    const value = path.split(".").reduce((place, part) => place?.[part], /** @type {any} */ (marker));
     return [path, value === null || value === undefined ? "" : String(value)];
   }));
   const form = useForm({ ...start, reason: "" });

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,33 @@ def test_every_operation_belongs_to_a_part_that_is_described(server: LiveServer)
     used = {tag for path in document["paths"].values() for operation in path.values() for tag in operation["tags"]}
     assert used == {tag["name"] for tag in document["tags"]}
     assert all(tag["description"].endswith(".") for tag in document["tags"])
+
+
+def test_every_operation_has_a_summary_that_somebody_wrote(server: LiveServer) -> None:
+    for path, operations in server.app.openapi()["paths"].items():
+        for method, operation in operations.items():
+            summary = operation["summary"]
+            assert 8 < len(summary) <= 70, (method, path, summary)
+            assert summary != operation["operationId"].replace("_", " ").title(), (method, path)
+            assert summary[0].isupper(), (method, path)
+            assert not summary.endswith("."), (method, path)
+
+
+def test_problems_that_operations_share_are_described_once(server: LiveServer) -> None:
+    document = server.app.openapi()
+    read = document["paths"]["/v1/markers/{marker_id}"]["get"]["responses"]
+    assert read["404"] == {"$ref": "#/components/responses/Problem404"}
+    assert "not-found" in document["components"]["responses"]["Problem404"]["description"]
+    public = document["paths"]["/m/{marker_id}"]["get"]["responses"]
+    assert public["404"] == {"$ref": "#/components/responses/ProblemOrPage404"}
+    described = [
+        json.dumps(response)
+        for operations in document["paths"].values()
+        for operation in operations.values()
+        for response in operation["responses"].values()
+        if "application/problem+json" in response.get("content", {})
+    ]
+    assert len(described) == len(set(described))
 
 
 def test_files_have_media_types_and_are_binary(server: LiveServer) -> None:

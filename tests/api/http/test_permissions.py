@@ -47,13 +47,20 @@ NOBODY_ID = "019cb624-0000-7000-8000-00000000ffff"
 UPLOAD = "POST /v1/decodes"
 # what a parameter of a path may be where it names no row
 FORMS = {
-    "artwork": "svg", "board": "svg", "layout": "csv", "maintenance": "csv", "map": "osm", "payload": "json",
-    "readings": "csv", "track": "csv",
-}  # fmt: skip
+    "annotated": "png",
+    "artwork": "svg",
+    "board": "svg",
+    "layout": "csv",
+    "maintenance": "csv",
+    "map": "osm",
+    "overlay": "png",
+    "payload": "json",
+    "readings": "csv",
+    "track": "csv",
+}
 VALUES = {
     "version": ("1",),
     "kind": ("geojson",),
-    "suffix": ("png",),
     "collection": ("markers",),
     "matrix_set": ("WebMercatorQuad",),
     "zoom": ("0",),
@@ -100,7 +107,7 @@ NOT_MADE = (
     "/samples",
     "/packets",
     "/lane.geojson",
-    "/overlay.{suffix}",
+    "/overlay.{form}",
 )
 
 
@@ -533,7 +540,7 @@ def test_vehicles_see_their_own_decodes_only(server: LiveServer) -> None:
         for route, allowed in PERMISSIONS.items():
             if "{decode_id}" not in route or allowed < EVERYBODY - {Scope.VIEWER}:
                 continue
-            path = route.partition(" ")[2].replace("{suffix}", "png").replace("{form}", "csv")
+            path = fill(route.partition(" ")[2], {**nobodys(route), "decode_id": "{decode_id}"})
             answers = [ask(one, route, path.replace("{decode_id}", decode)) for decode in (theirs, NOBODY_ID)]
             assert [answer.status_code for answer in answers] == [404, 404], route
             bodies = [re.sub(r'"request_id":"\w+"', "", answer.text) for answer in answers]

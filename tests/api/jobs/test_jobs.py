@@ -130,7 +130,7 @@ def test_jobs_of_all_kinds_are_listed_and_filtered(server: LiveServer, client: h
     assert client.get(f"/v1/jobs/{plan.id}").json()["error"] == {
         "kind": "UnreadableUpload", "detail": "no road", "field": "file"
     }  # fmt: skip
-    for wrong in ({"kind": "lunch"}, {"state": "lost"}, {"limit": 0}, {"after": plan.id}):
+    for wrong in ({"kind": "lunch"}, {"state": "lost"}, {"limit": 0}, {"before": plan.id}):
         assert client.get("/v1/jobs", params=wrong).status_code in (400, 422)
 
 

@@ -86,10 +86,10 @@ def test_nobody_sees_what_was_seen_of_anothers_marker(server: LiveServer, marker
 @pytest.mark.parametrize(
     ("query", "field"),
     [
-        ("before=x", "before"),
-        ("before=2026-03-04T05:06:07,x,1", "before"),
-        ("before=2026-03-04T05:06:07Z,x,-1", "before"),
-        ("before=0001-01-01T00:00:00Z,x,1", "before"),
+        ("after=x", "after"),
+        ("after=2026-03-04T05:06:07,x,1", "after"),
+        ("after=2026-03-04T05:06:07Z,x,-1", "after"),
+        ("after=0001-01-01T00:00:00Z,x,1", "after"),
         ("since=2026-03-04T05:06:07", "since"),
         ("since=0001-01-01T00:00:00Z", "since"),
         ("until=9999-12-31T23:59:59-14:00", "until"),

@@ -292,7 +292,7 @@ def test_pages_of_reports(
         url = answer.links.get("next", {}).get("url", "")
     assert found == everything
     assert len({report["id"] for report in found}) == 3
-    for wrong in ({"status": "old"}, {"marker_id": "x"}, {"before": "x"}, {"kind": "loose"}):
+    for wrong in ({"status": "old"}, {"marker_id": "x"}, {"after": "x"}, {"kind": "loose"}):
         assert owner.get("/v1/damage-reports", params=wrong).status_code in (400, 422)
 
 

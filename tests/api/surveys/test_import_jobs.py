@@ -79,7 +79,7 @@ def test_jobs_are_listed_newest_first(server: LiveServer, client: httpx.Client, 
         for state in ("queued", "running", "done", "failed", "cancelled")
     }
     assert by_state == {"queued": ids[:0:-1], "running": [], "done": [first], "failed": [], "cancelled": []}
-    for wrong in ({"state": "lost"}, {"limit": 0}, {"limit": 1001}, {"before": "x\u0000"}, {"after": ids[0]}):
+    for wrong in ({"state": "lost"}, {"limit": 0}, {"limit": 1001}, {"after": "x\u0000"}, {"before": ids[0]}):
         assert client.get("/v1/imports", params=wrong).status_code in (400, 422)
     with server.agency("imports of others") as other:
         assert other.get("/v1/imports").json()["items"] == []
