@@ -76,7 +76,7 @@ class BoardIn(StrictModel):
     square_mm: Number = Field(25.0, description="Side of a square, 8 to 250. [mm]")
     marker_mm: Number = Field(18.0, description="Side of a marker, 0.5 to 0.85 of a square. [mm]")
 
-    def given(self) -> CalibrationBoard:
+    def calibration_board(self) -> CalibrationBoard:
         """The board as the core knows it."""
         return CalibrationBoard(self.columns, self.rows, self.square_mm, self.marker_mm)
 
@@ -181,7 +181,7 @@ def post_calibration(caller: Caller, asked: Asked, calibrations: CalibrationServ
     vehicle's camera. The photos are not kept.
     """
     document, replayed = calibrations.run(
-        caller, asked.photos, asked.declared.board.given(), asked.declared.coefficients, asked.idempotency
+        caller, asked.photos, asked.declared.board.calibration_board(), asked.declared.coefficients, asked.idempotency
     )
     return created_response(document, replayed, path="/v1/calibrations")
 
@@ -248,13 +248,13 @@ class ProfileIn(StrictModel):
     trace: TraceIn | None = Field(None, description="Magnetometer bar, axes, unit and rate; {} for METRO's own.")
     packets: PacketsIn | None = Field(None, description="Receiver, poses and clock of packet logs; {} for the usual.")
 
-    def given(self) -> dict[str, Any]:
+    def values(self) -> dict[str, Any]:
         """The values that the request sets."""
         return self.model_dump(exclude_unset=True, exclude_none=True)
 
     def sections(self) -> dict[str, Any]:
         """Sections that the request names; None for those that are removed."""
-        values = self.given()
+        values = self.values()
         return {name: values.get(name) for name in self.model_fields_set}
 
 
@@ -339,7 +339,7 @@ VehicleService = Annotated[Vehicles, use_cases("vehicles")]
 )
 def post_vehicle(vehicle: VehicleIn, caller: Caller, vehicles: VehicleService, idempotency: Idempotency) -> Response:
     """Add a vehicle with its sensor profile; uploads that name it inherit the profile."""
-    document, replayed = vehicles.add(caller, vehicle.name, vehicle.profile.given(), vehicle.note, idempotency)
+    document, replayed = vehicles.add(caller, vehicle.name, vehicle.profile.values(), vehicle.note, idempotency)
     return created_response(document, replayed, path="/v1/vehicles")
 
 

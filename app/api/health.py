@@ -72,7 +72,7 @@ class DismissalIn(BaseModel):
     """Why an item is dismissed."""
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"note": "the marker was surveyed again and stands right"}]}
+        extra="forbid", json_schema_extra={"examples": [{"note": "the marker was surveyed again and is in its place"}]}
     )
 
     note: Text = Field(min_length=1, max_length=300)
@@ -126,7 +126,7 @@ def approve_maintenance_item(
 def dismiss_maintenance_item(
     item_id: ItemId, dismissal: DismissalIn, caller: Caller, maintenance: Maintenance
 ) -> Response:
-    """Reject an item with a reason: its test starts anew."""
+    """Reject an item with a reason: its test starts again."""
     return json_response(maintenance.dismiss(caller, item_id, dismissal.note))
 
 

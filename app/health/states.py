@@ -45,7 +45,7 @@ class HealthRules:
     false_alarm_share : float
         Share of healthy markers that become suspects in a month of traffic, at most.
     lower : float
-        Logarithm of the ratio at which a marker is accepted as healthy, and the test starts anew. [nat]
+        Logarithm of the ratio at which a marker is accepted as healthy, and the test starts again. [nat]
     vehicles : int
         Distinct vehicles without which no marker becomes a suspect.
     vehicle_bound : float

@@ -73,7 +73,7 @@ _TOLERANCE_M = 0.0005  # [m] rounding of positions; source: by hand
 
 @dataclass(frozen=True, slots=True)
 class Neighbour:
-    """Another marker near by.
+    """Another marker nearby.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Site:
     readable_clearance_m : float
         Up to which clearance the decoder reads. [m]
     neighbours : tuple of Neighbour
-        Markers near by: of other lanes, of lines, of other tags.
+        Markers nearby: of other lanes, of lines, of other tags.
     reaction_s, deceleration_mps2 : float
         Of the driver or the system that acts on the tag. [s], [m/s2]
 

@@ -218,7 +218,7 @@ agency_secrets = sa.Table(
     sa.Column("created_at", UtcTime, nullable=False),
 )
 
-# which transmissions of a CERPM were heard and when: what is sent again is known by it
+# which transmissions of a CERPM were received and when: what is sent again is known by it
 cerpm_spans = sa.Table(
     "cerpm_spans",
     metadata,

@@ -111,7 +111,7 @@ class Shot:
     code : PlateCode or None
         On the first face; None where there is no plate.
     codebook : tuple of PlateCode
-        Of plates registered near by.
+        Of plates registered nearby.
     camera : Camera
     scene : PlateScene or None
         To render it again with other faces, with the ``background`` and the seed of its noise.

@@ -31,7 +31,7 @@ _TAGS = {
     "markers": "Markers of every family: surveyed positions, states, history, bulk writes and searches.",
     "artwork": "Printable plates and signs, with proofs of what a camera reads.",
     "layouts": "Magnet tags: holes to drill for a meaning.",
-    "cerpms": "Radio markers: keys, frames, and how far they are heard.",
+    "cerpms": "Radio markers: keys, frames, and how far they are received.",
     "codebooks": "Meanings of magnet tags.",
     "roads": "Road axes, stations along them, and the markers beside them.",
     "plans": "Plans of a road: alignments, rules, placement, proofs, files for crews, and commits.",

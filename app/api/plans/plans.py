@@ -312,7 +312,7 @@ def post_package(
 def get_package(
     plan_id: PlanId, caller: Caller, packages: PackageService, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """The package of a plan, as it was packed last; 404 if its markers were placed anew since."""
+    """The package of a plan, as it was packed last; 404 if its markers were placed again since."""
     package = packages.open(caller, plan_id)
     headers = {"ETag": f'"{package.sha256}"'}
     if if_none_match == headers["ETag"]:
@@ -346,7 +346,7 @@ def post_proof(
 
     The same plan, terms and seed give the same report. A checked plan is `proved` if no reading was wrong; weak markers
     are listed and change nothing. The proof belongs to the markers as they are placed now: if other rules place them
-    anew in the meantime, the plan is not proved.
+    again in the meantime, the plan is not proved.
     """
     return queued_response(*proofs.request(caller, plan_id, terms, version, idempotency))
 

@@ -77,7 +77,7 @@ def get_damage_report(report_id: ReportId, caller: Caller, reports: Service) -> 
 
 @router.get("/{report_id}/photo", responses={**file_response(["image/jpeg"]), **problem_responses(404)})
 def get_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """The photo of a report: a JPEG that was written anew, without metadata."""
+    """The photo of a report: a new JPEG of its pixels, without metadata."""
     return Response(reports.photo(caller, report_id), headers=_PHOTO_HEADERS, media_type="image/jpeg")
 
 

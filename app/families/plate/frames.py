@@ -60,7 +60,7 @@ class PlateSearch:
     ----------
     camera : Camera or None
     codebook : tuple of PlateCode
-        Plates that the registry knows near by.
+        Plates that the registry knows nearby.
     geometries : tuple of PlateGeometry
         Dimensions to look for; the decoder's own where there are none.
     """
@@ -103,9 +103,9 @@ class PlateReadingDocument(TypedDict):
 
     `certainty` is `sure` with `digits`. It is `tentative` with `likely_digits`, which are too unsure to be matched or
     to give a position, and `doubtful_cells`, the cells that may be wrong: other frames of an archive, or a registered
-    plate near by, may confirm them. It is null where there are no digits.
+    plate nearby, may confirm them. It is null where there are no digits.
 
-    `scheme` is that of the registered plate near by with these digits. Without one, `possible_schemes` has all schemes
+    `scheme` is that of the registered plate nearby with these digits. Without one, `possible_schemes` has all schemes
     whose checks the digits satisfy: one check digit holds by accident for one `position` plate in ten, two for one in a
     hundred.
     """
@@ -155,7 +155,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
         self._decode = decode
 
     def search(self, nearby: Nearby, camera: Camera | None) -> PlateSearch:
-        """The codes near by, and their dimensions beside the usual ones."""
+        """The codes nearby, and their dimensions beside the usual ones."""
         geometries = _distinct([*EXPECTED_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)])
         return PlateSearch(camera, plate_codebook(nearby), geometries)
 
@@ -208,7 +208,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
 
 
 def plate_codebook(nearby: Nearby) -> tuple[PlateCode, ...]:
-    """Codes of the plates near by, without repetitions; none if not all of them are known."""
+    """Codes of the plates nearby, without repetitions; none if not all of them are known."""
     return tuple(dict.fromkeys(plate_code(row) for row in nearby.rows)) if nearby.complete else ()
 
 

@@ -139,7 +139,7 @@ class PlatePass:
         As in `Drive`.
     fps : float
     codebook : sequence of PlateCode
-        Of the plates near by.
+        Of the plates nearby.
     survey_error_m : ndarray, shape (2,)
         East and north of the registered from the true position. [m]
     survey_rmse_m : float

@@ -49,7 +49,7 @@ class UnitKind(StrEnum):
 class ProofTerms(BaseModel):
     """What is driven, and how. The same plan, terms and seed give the same result.
 
-    `lost_share` of the markers are missing, drawn anew for each drive. Drives take the conditions in turn, and the
+    `lost_share` of the markers are missing, drawn again for each drive. Drives take the conditions in turn, and the
     cameras in turn after each round of conditions. The uncertainty of a survey is radial, as in the registry.
     """
 
@@ -229,7 +229,7 @@ class LanePath(TypedDict):
         Of the distances of the covered places from the path. [m2, m]
     worst_at_m : float
         Chainage of the greatest distance. [m]
-    heard, markers : int
+    received, markers : int
         Markers that were received and verified, of those along the stretch.
     left_out : list of int
         Numbers of markers that the path leaves out.
@@ -242,7 +242,7 @@ class LanePath(TypedDict):
     square_sum_m2: float
     worst_m: float
     worst_at_m: float
-    heard: int
+    received: int
     markers: int
     left_out: list[int]
     refusal: str | None

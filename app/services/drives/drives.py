@@ -101,7 +101,7 @@ class Drives:
         found = collect(rows, use_unfit=drive.use_unfit)
         if not found.fixes:
             raise _nothing(rows)
-        check_times(found.given({}))
+        check_times(found.track_input({}))
         job_input = {
             "name": drive.name,
             "decodes": [asdict(entry) for entry in drive.decodes],
@@ -130,7 +130,7 @@ class Drives:
             survey = _survey_m2(connection, agency_id, found)
         job.report_progress(_COLLECTED)
         task = TrackTask(
-            given["name"] or f"drive {job.row.id}", found.given(survey), TrackRules(**options),
+            given["name"] or f"drive {job.row.id}", found.track_input(survey), TrackRules(**options),
             tuple(found.left_out), tuple(found.on_lane), tuple(found.warnings),
         )  # fmt: skip
         written = self._processes.submit(task, wait_s=_WAIT_S).result()
