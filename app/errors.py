@@ -82,7 +82,7 @@ class Conflict(WaymarkError):
 
 
 class CodeTaken(Conflict):
-    """Another marker near by already carries this code."""
+    """Another marker nearby already carries this code."""
 
 
 class IdempotencyConflict(Conflict):

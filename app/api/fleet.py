@@ -77,7 +77,7 @@ class BoardIn(StrictModel):
     square_mm: Number = Field(25.0, description="Side of a square, 8 to 250. [mm]")
     marker_mm: Number = Field(18.0, description="Side of a marker, 0.5 to 0.85 of a square. [mm]")
 
-    def given(self) -> CalibrationBoard:
+    def calibration_board(self) -> CalibrationBoard:
         """The board as the core knows it."""
         return CalibrationBoard(self.columns, self.rows, self.square_mm, self.marker_mm)
 
@@ -187,7 +187,7 @@ def post_calibration(caller: Caller, asked: Asked, calibrations: CalibrationServ
     vehicle's camera. The photos are not kept.
     """
     document, replayed = calibrations.run(
-        caller, asked.photos, asked.declared.board.given(), asked.declared.coefficients, asked.idempotency
+        caller, asked.photos, asked.declared.board.calibration_board(), asked.declared.coefficients, asked.idempotency
     )
     return created_response(document, replayed, path="/v1/calibrations")
 
@@ -260,13 +260,13 @@ class ProfileIn(StrictModel):
     trace: TraceIn | None = Field(None, description="Magnetometer bar, axes, unit and rate; {} for METRO's own.")
     packets: PacketsIn | None = Field(None, description="Receiver, poses and clock of packet logs; {} for the usual.")
 
-    def given(self) -> dict[str, Any]:
+    def values(self) -> dict[str, Any]:
         """The values that the request sets."""
         return self.model_dump(exclude_unset=True, exclude_none=True)
 
     def sections(self) -> dict[str, Any]:
         """Sections that the request names; None for those that are removed."""
-        values = self.given()
+        values = self.values()
         return {name: values.get(name) for name in self.model_fields_set}
 
 
@@ -354,7 +354,7 @@ def post_vehicle(vehicle: VehicleIn, caller: Caller, vehicles: VehicleService, i
 
     Uploads that name it inherit the profile.
     """
-    document, replayed = vehicles.add(caller, vehicle.name, vehicle.profile.given(), vehicle.note, idempotency)
+    document, replayed = vehicles.add(caller, vehicle.name, vehicle.profile.values(), vehicle.note, idempotency)
     return created_response(document, replayed, path="/v1/vehicles")
 
 

@@ -72,7 +72,7 @@ class DismissalIn(BaseModel):
     """Why an item is dismissed."""
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"note": "the marker was surveyed again and stands right"}]}
+        extra="forbid", json_schema_extra={"examples": [{"note": "the marker was surveyed again and is in its place"}]}
     )
 
     note: Text = Field(min_length=1, max_length=300)
@@ -138,7 +138,7 @@ def dismiss_maintenance_item(
 ) -> Response:
     """Reject an item of the work list.
 
-    With a reason. Its test starts anew.
+    With a reason. Its test starts again.
     """
     return json_response(maintenance.dismiss(caller, item_id, dismissal.note))
 

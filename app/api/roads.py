@@ -79,7 +79,7 @@ class StationIn(StrictModel):
         None, description="Instead of a vertex: distance along the axis from the start of its first line. [m]"
     )
 
-    def given(self) -> CalibrationInput:
+    def calibration_input(self) -> CalibrationInput:
         """The point as the use cases know it."""
         position = (self.position[0], self.position[1]) if self.position is not None else None
         return CalibrationInput(self.measure_m, self.ahead_m, self.part, self.vertex, position, self.chainage_m)
@@ -199,7 +199,7 @@ def post_road(road: RoadIn, caller: Caller, roads: Roads, idempotency: Idempoten
     new = NewRoad(
         road.name,
         road.lines(road.geometry),
-        tuple(point.given() for point in road.calibration),
+        tuple(point.calibration_input() for point in road.calibration),
         road.measure_markers,
         road.dry_run,
         road.reason,
@@ -249,7 +249,7 @@ def patch_road(road_id: RoadId, patch: RoadPatch, caller: Caller, roads: Roads, 
         )
     change = RoadChange(
         patch.lines(patch.geometry) if patch.geometry is not None else None,
-        tuple(point.given() for point in patch.calibration) if patch.calibration is not None else None,
+        tuple(point.calibration_input() for point in patch.calibration) if patch.calibration is not None else None,
         patch.measure_markers,
         patch.dry_run,
         patch.reason,

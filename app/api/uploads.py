@@ -298,7 +298,7 @@ class CompleteIn(BaseModel):
 
 async def _started_parts(request: Request, caller: Caller, uploads: Service) -> Response:
     wanted = await read_declaration(PartsIn, await request.body(), "body")
-    context = (wanted.context or ContextIn()).given(wanted.file_name)
+    context = (wanted.context or ContextIn()).context_input(wanted.file_name)
     made, urls = await in_thread(partial(uploads.create_parts, caller, wanted.size, context))
     document: UploadDocument = {**made, "part_bytes": PART_BYTES, "part_urls": urls}
     return json_response(document, 201, {"Location": f"/v1/uploads/{made['id']}"})

@@ -208,7 +208,7 @@ def verify_log(
 ) -> None:
     """Compute every hash of the history again and print each fault. The exit status is 1 if there is any.
 
-    With --heads only what was written since the last check is checked. The file is written anew where no fault was
+    With --heads only what was written since the last check is checked. The file is written again where no fault was
     found; without it, or for an agency that it does not name, the whole history is checked.
     """
     from app.services.access.audit import AuditLog, parse_head

@@ -73,7 +73,7 @@ def _finished(results_file: Path, header: dict[str, Any]) -> dict[str, UnitResul
     except orjson.JSONDecodeError as error:
         raise UnreadableUpload(
             f"{results_file.name} is damaged", field=str(results_file), limit="one JSON object a line",
-            cure="remove the file; the proof then starts anew",
+            cure="remove the file; the proof then starts from the beginning",
         ) from error  # fmt: skip
     if lines[-1]:
         results_file.write_bytes(b"".join(line + b"\n" for line in whole))

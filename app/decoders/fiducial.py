@@ -319,7 +319,7 @@ SURE = 0.99
 """Least posterior probability at which a code is returned. Source: as of plates with check digits, chosen by hand."""
 DEFAULT_DICTIONARIES = ("apriltag-36h11", "aruco-mip-36h12", "aruco-6x6-250", "aruco-5x5-250", "apriltag-25h9")
 """Looked for besides the registered ones: dictionaries that are strong enough to be read without a registry."""
-_EXPECTED = 0.9  # [-] prior share of the registered signs near by among the signs in view; chosen by hand
+_EXPECTED = 0.9  # [-] prior share of the registered signs nearby among the signs in view; chosen by hand
 _MIN_SPREAD = 0.1  # [-] of a module's darkness: blur and uneven print; chosen by hand
 _DAMAGED = 0.02  # [-] probability that a module shows nothing of its code: dirt, reflections; chosen by hand
 _MIN_SQUARES = 20  # [-] squares for each sign that a frame has at least, a priori; chosen by hand
@@ -350,7 +350,7 @@ def decode_fiducials(
     ----------
     pixels : ndarray of uint8, shape (H, W, 3) BGR or (H, W) grey
     known : sequence of KnownFiducial
-        Signs that are registered near by; only these have poses.
+        Signs that are registered nearby; only these have poses.
     camera : Camera, optional
         Of the frame; without it there are no poses.
     dictionaries : sequence of str
@@ -467,7 +467,7 @@ def _log_likelihoods(square: SampledSquare) -> tuple[Floats, Floats]:
 
 
 def _log_priors(owners: Sequence[tuple[str, int]], known: Sequence[KnownFiducial]) -> Floats:
-    """Prior of each codeword: the registered signs near by share 0.9, all codewords the rest."""
+    """Prior of each codeword: the registered signs nearby share 0.9, all codewords the rest."""
     expected = {sign.code.text for sign in known}
     texts = [f"{get_dictionary(name).series}-{number}" for name, number in owners]
     is_expected = np.array([text in expected for text in texts])

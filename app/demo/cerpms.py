@@ -127,7 +127,7 @@ def drive_lane_and_judge(
     client: httpx.Client, built: BuiltLane, drive: LaneDrive, number: int, before: Sequence[ReceivedPacket],
     rng: np.random.Generator,
 ) -> tuple[LaneResult, dict[str, Any], bytes, dict[str, Any], list[ReceivedPacket]]:  # fmt: skip
-    """Drive past what is built, upload what was heard, compare with the truth.
+    """Drive past what is built, upload what was received, compare with the truth.
 
     Returns
     -------
@@ -148,16 +148,16 @@ def drive_lane_and_judge(
         installed = move_claim(built.lane, installed, row, rng, distance_m=MOVED_M)
     start_s = _START_S + number * _DRIVE_APART_S
     first = np.full(len(installed), int(number * _DRIVE_APART_S / INTERVAL_S))
-    heard = drive_past(
+    simulated = drive_past(
         built.lane, installed, rng, sign=lambda message: _sign(built, message), radio=Radio(interval_s=INTERVAL_S),
         receiver=drive.receiver, start_s=start_s, first_sequence=first,
     )  # fmt: skip
-    packets = list(heard.packets)
+    packets = list(simulated.packets)
     if drive.attacked:
-        span = (float(heard.drive.time_s[0]), float(heard.drive.time_s[-1]))
+        span = (float(simulated.drive.time_s[0]), float(simulated.drive.time_s[-1]))
         packets += forge_packets(packets, FORGED, rng) + replay_packets(list(before), REPLAYED, rng, at_s=span)
         packets = number_entries(sorted(packets, key=lambda packet: packet.received_at_s))
-    recording, captured_at = _pack(built, heard, packets)
+    recording, captured_at = _pack(built, simulated, packets)
     context = {
         "camera": {**CAMERA, "width_px": _FRAME_PX[0], "height_px": _FRAME_PX[1]},
         "captured_at": captured_at,
@@ -168,7 +168,7 @@ def drive_lane_and_judge(
         "context": ("context", json.dumps(context).encode(), "application/json"),
     }
     decode: dict[str, Any] = checked(client.post("/v1/decodes", files=parts)).json()
-    return judge_lane(built, drive, moved, heard, decode), decode, recording, context, list(heard.packets)
+    return judge_lane(built, drive, moved, simulated, decode), decode, recording, context, list(simulated.packets)
 
 
 def _sign(built: BuiltLane, message: CerpmMessage) -> bytes:
@@ -176,11 +176,11 @@ def _sign(built: BuiltLane, message: CerpmMessage) -> bytes:
 
 
 def judge_lane(
-    built: BuiltLane, drive: LaneDrive, moved: int | None, heard: SimulatedDrive, decode: dict[str, Any]
+    built: BuiltLane, drive: LaneDrive, moved: int | None, simulated: SimulatedDrive, decode: dict[str, Any]
 ) -> LaneResult:
     """The server's answer against what was simulated."""
     verdicts, lane = decode["report"]["verdicts"], decode["lane"]
-    true = {packet.payload for packet in heard.packets}
+    true = {packet.payload for packet in simulated.packets}
     result = LaneResult(
         drive.name,
         markers=len(built.installed),
@@ -199,7 +199,7 @@ def judge_lane(
     result.path_max_m = float(np.abs(errors).max())
     result.coverage = covered
     track_errors, _covered = path_errors_m(
-        built.lane, built.lane.enu_from_wgs84(heard.track.lon_deg, heard.track.lat_deg)
+        built.lane, built.lane.enu_from_wgs84(simulated.track.lon_deg, simulated.track.lat_deg)
     )
     result.track_rms_m = float(np.sqrt(np.mean(track_errors**2)))
     steering = check_steering(
@@ -232,13 +232,13 @@ def path_errors_m(lane: TrueLane, path_m: Floats) -> tuple[Floats, float]:
 # --- what the vehicle uploads -------------------------------------------------------------------------------------
 
 
-def _pack(built: BuiltLane, heard: SimulatedDrive, packets: Sequence[ReceivedPacket]) -> tuple[bytes, str]:
-    at_s = float(heard.track.time_s[int(_FRAME_AT * len(heard.track.time_s))])
+def _pack(built: BuiltLane, simulated: SimulatedDrive, packets: Sequence[ReceivedPacket]) -> tuple[bytes, str]:
+    at_s = float(simulated.track.time_s[int(_FRAME_AT * len(simulated.track.time_s))])
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("packets.jsonl", write_packets(packets))
-        archive.writestr("poses.csv", write_poses(heard.track))
-        archive.writestr("frame.jpg", draw_frame(built.lane, heard, at_s))
+        archive.writestr("poses.csv", write_poses(simulated.track))
+        archive.writestr("frame.jpg", draw_frame(built.lane, simulated, at_s))
     return packed.getvalue(), datetime.fromtimestamp(at_s, UTC).isoformat()
 
 
@@ -267,11 +267,11 @@ def write_poses(track: PoseTrack) -> str:
     return stream.getvalue()
 
 
-def draw_frame(lane: TrueLane, heard: SimulatedDrive, at_s: float) -> bytes:
+def draw_frame(lane: TrueLane, simulated: SimulatedDrive, at_s: float) -> bytes:
     """A plain camera frame of the true lane: asphalt, sky and painted lines. JPEG."""
     width, height = _FRAME_PX
     camera = Camera.from_field_of_view(width, height, **CAMERA)
-    drive = heard.drive
+    drive = simulated.drive
     east, north = (float(np.interp(at_s, drive.time_s, drive.point_m[:, k])) for k in range(2))
     heading_deg = float(90.0 - np.degrees(np.interp(at_s, drive.time_s, drive.yaw_rad)))
     picture = np.full((height, width, 3), 90, np.uint8)

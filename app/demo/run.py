@@ -268,10 +268,10 @@ def _demonstrate_cerpms(client: httpx.Client, out: Path, say: Say) -> tuple[list
     say("settings that Waymark tries and that EU868 permits reach 99 %.")
     say("Simulating drives past them; uploading each drive as packets, poses and a camera frame ...")
     results: list[LaneResult] = []
-    heard: list[ReceivedPacket] = []
+    received: list[ReceivedPacket] = []
     for number, drive in enumerate(list_lane_drives()):
         rng = np.random.default_rng([_SEED, 200, number])
-        result, decode, recording, context, heard = drive_lane_and_judge(client, built, drive, number, heard, rng)
+        result, decode, recording, context, received = drive_lane_and_judge(client, built, drive, number, received, rng)
         say(f"  {drive.name}: {decode['summary']['text']}")
         results.append(result)
         if number == 0:

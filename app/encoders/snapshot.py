@@ -43,7 +43,7 @@ def write_snapshot(
         Markers in any order, some thousands at a time, each block by columns; a missing value is None or NaN. id,
         status, code, kind (`kind_text`), lon_deg, lat_deg, height_m, vertical_datum, heading_deg, horizontal_rmse_m,
         vertical_rmse_m, heading_rmse_deg, localization_grade; of information tags lane_lon_deg and lane_lat_deg, where
-        their lane begins; of CERPMs that were heard before first_sequence, last_sequence, and first_heard_s,
+        their lane begins; of CERPMs that were received before first_sequence, last_sequence, and first_heard_s,
         last_heard_s.
     agency_id : str
     area_deg : tuple of float

@@ -191,7 +191,7 @@ class CerpmIn(Headed, MarkerIn):
     number: Annotated[int, Field(strict=True, ge=1, le=MAX_NUMBER)] | None = Field(
         None, description="Within the agency; the next free one if left out."
     )
-    side: Side = Field("unknown", description="Boundary of the lane that it stands on, in the direction of travel.")
+    side: Side = Field("unknown", description="Boundary of the lane that it is on, in the direction of travel.")
     speed_limit: SpeedLimitIn | None = Field(None, description="As it is posted; nothing where none is.")
     dev_eui: DevEui | None = Field(None, description="LoRaWAN DevEUI, where the marker joins a network.")
     radio: RadioIn = Field(default_factory=lambda: RadioIn())
@@ -336,7 +336,7 @@ _HEARD = ("first_sequence", "last_sequence", "first_heard_s", "last_heard_s")
 
 
 class CerpmSnapshot(SnapshotRecord):
-    """Side, speed limit and interval of CERPMs, and which transmissions were heard.
+    """Side, speed limit and interval of CERPMs, and which transmissions were received.
 
     Retired ones are included: whoever has their keys can still send.
     """
@@ -361,9 +361,9 @@ class CerpmSnapshot(SnapshotRecord):
         return {"side": spec["side"], "speed_limit": spec["speed_limit"], "min_interval_s": min_interval_s}
 
     def members(self, connection: sa.Connection, agency_id: str, codes: Sequence[str]) -> Mapping[str, Sequence[Any]]:
-        """First and last transmission that was heard of each."""
-        heard = cerpms.list_span_ends(connection, agency_id, map(int, codes))
-        ends = [heard.get(int(code)) for code in codes]
+        """First and last transmission that was received from each."""
+        received = cerpms.list_span_ends(connection, agency_id, map(int, codes))
+        ends = [received.get(int(code)) for code in codes]
         return {name: [None if end is None else getattr(end, name) for end in ends] for name in _HEARD}
 
 

@@ -53,7 +53,7 @@ from app.families.surveys import (
     RowCodes,
     Rows,
     SurveyImport,
-    is_placed_anew,
+    is_placed_again,
     listed_codes,
 )
 from app.formats.surveys.roles import CodeForm
@@ -219,7 +219,7 @@ def known_fiducial(row: MarkerRow) -> KnownFiducial:
 
 @dataclass(frozen=True, slots=True)
 class FiducialSearch:
-    """What to look for in a frame: the signs that the registry has near by, with the camera."""
+    """What to look for in a frame: the signs that the registry has nearby, with the camera."""
 
     known: tuple[KnownFiducial, ...]
     camera: Camera | None = None
@@ -242,12 +242,12 @@ class FiducialReadingDocument(TypedDict):
 
 
 class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
-    """Reads fiducial signs in frames, where the registry has some near by."""
+    """Reads fiducial signs in frames, where the registry has some nearby."""
 
     document_type = FiducialReadingDocument
 
     def search(self, nearby: Nearby, camera: Camera | None) -> FiducialSearch | None:
-        """The signs near by; None without any: looking for them takes as long as looking for plates."""
+        """The signs nearby; None without any: looking for them takes as long as looking for plates."""
         known = tuple(dict.fromkeys(known_fiducial(row) for row in nearby.rows))
         return FiducialSearch(known, camera) if known else None
 
@@ -270,7 +270,7 @@ class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
         rows = [row for row in nearby.rows if fiducial_code(row).text == code.text]
         if rows:
             return nearest_match(rows, position, "fiducial sign")
-        return Match(None, note="no sign of this agency near by carries this code")
+        return Match(None, note="no sign of this agency nearby carries this code")
 
     def document(self, reading: FiducialReading) -> FiducialReadingDocument:
         """A reading as clients see it."""
@@ -410,7 +410,7 @@ class FiducialSurvey(SurveyImport[KnownFiducial | None]):
         agency_id: str,
         rules: MarkerRules,
     ) -> bool:
-        """With a sign near by that has the same code."""
+        """With a sign nearby that has the same code."""
         if known.status == RETIRED:
             return False
         return distance_m(*place, known.lon_deg, known.lat_deg) <= rules.position_code_radius_m
@@ -463,7 +463,7 @@ class Fiducials(Family[NewFiducial, PlacedPosition]):
         Raises
         ------
         CodeTaken
-            Another sign near by carries the code.
+            Another sign nearby carries the code.
         """
         _check_free(connection, registration, new.code.text, prepared.lon_deg, prepared.lat_deg)
         geometry = new.geometry
@@ -488,9 +488,9 @@ class Fiducials(Family[NewFiducial, PlacedPosition]):
         Raises
         ------
         CodeTaken
-            At its new place, or back in use, another sign near by carries the code.
+            At its new place, or back in use, another sign nearby carries the code.
         """
-        if is_placed_anew(row, values):
+        if is_placed_again(row, values):
             merged = row._replace(**values)
             _check_free(connection, registration, row.digits, merged.lon_deg, merged.lat_deg, row.id)
         return {}
@@ -526,7 +526,7 @@ def _check_free(
     lat_deg: float,
     ignoring: str | None = None,
 ) -> None:
-    """Refuse a code that another sign near by carries: a vehicle between them could not say which one it sees."""
+    """Refuse a code that another sign nearby carries: a vehicle between them could not say which one it sees."""
     radius_m = registration.rules.position_code_radius_m
     other = store.find_code_near(
         connection, text, lon_deg, lat_deg, radius_m, mismatched_radius_m=radius_m, ignoring=ignoring

@@ -42,7 +42,7 @@ class MarkerRules:
     idempotency_ttl: timedelta = timedelta(hours=24)
 
 
-def is_placed_anew(row: MarkerRow, values: dict[str, Any]) -> bool:
+def is_placed_again(row: MarkerRow, values: dict[str, Any]) -> bool:
     """Whether a change gives a position, or puts a retired marker back into use."""
     return "lon_deg" in values or (row.status == RETIRED and values.get("status", RETIRED) != RETIRED)
 

@@ -41,19 +41,28 @@ class HealthRules:
     """Error rates and bounds of the tests."""
 
     # share of healthy markers that become suspects in a month of traffic, at most
+    # share of healthy markers that become suspects in a month of traffic, at most
     false_alarm_share: float = 1e-3  # source: the registry's requirement, one marker in a thousand
-    # [nat] logarithm of the ratio at which a marker is accepted as healthy, and the test starts anew
+    # [nat] logarithm of the ratio at which a marker is accepted as healthy, and the test starts again
+    # [nat] logarithm of the ratio at which a marker is accepted as healthy, and the test starts again
     lower: float = 0.0  # [nat] source: Page, Biometrika 41, 1954: tests in a row find a fault whenever it begins
+    # distinct vehicles without which no marker becomes a suspect
     # distinct vehicles without which no marker becomes a suspect
     vehicles: int = 3  # source: chosen by hand; two may share a workshop, and so a wrong calibration
     # [nat] what one vehicle adds to a test at most, however often it passes
+    # [nat] what one vehicle adds to a test at most, however often it passes
     vehicle_bound: float = 5.0  # [nat] source: by hand; at 10,000 passes a month four vehicles are needed, and five do
+    # passes in a month that are assumed at least
     # passes in a month that are assumed at least
     month_passes: float = 100.0  # source: chosen by hand, three vehicles a day
     # share of the passes of healthy markers with which a test for a displacement begins
+    # share of the passes of healthy markers with which a test for a displacement begins
     moved_test_starts: float = 0.01  # source: the scenes of `python -m benchmarks.health`: 0.6 to 1.2 %, once 2.3 %
     # [m] smallest estimated displacement of a suspect
+    # [m] smallest estimated displacement of a suspect
     moved_m: float = 0.75  # [m] source: `python -m benchmarks.health`, finds 1.0 m in five passes
+    # [m] a marker that stands this near to its registered position has not moved; two standard deviations of the survey
+    # where they are more
     # [m] a marker that stands this near to its registered position has not moved; two standard deviations of the survey
     # where they are more
     disc_m: float = 0.25  # [m] source: by hand, what crews and surveys of roads are good to

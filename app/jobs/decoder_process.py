@@ -161,7 +161,7 @@ class Outcome(Enum):
 
 READY, READY_WITH_NETWORK = "ready", "ready, with network"
 """What a process sends when it can take tasks."""
-# glibc's mallopt: keep freed memory for the next frame, or the kernel clears every page of every frame anew
+# glibc's mallopt: keep freed memory for the next frame, or the kernel clears every page of every frame again
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _PR_SET_PDEATHSIG = 1  # Linux's prctl(2)
 _KEPT_BYTES = 256 * 1024**2

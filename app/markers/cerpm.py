@@ -45,7 +45,7 @@ NO_HEIGHT = 65535  # source: the highest value of 16 bits
 
 
 class LaneSide(IntEnum):
-    """Which boundary of the lane a marker stands on, seen in the direction of travel."""
+    """Which boundary of the lane a marker is on, seen in the direction of travel."""
 
     UNKNOWN = 0
     LEFT = 1

@@ -90,7 +90,7 @@ EXACT_FLAG: Final = 1
 ELLIPSOIDAL_FLAG: Final = 2
 """The height is above the ellipsoid."""
 HEARD_FLAG: Final = 4
-"""Transmissions of the CERPM were heard before."""
+"""Transmissions of the CERPM were received before."""
 
 RETIRED: Final = "retired"
 """Only CERPMs: what they say counts no more, whoever has their keys."""

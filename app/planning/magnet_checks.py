@@ -73,7 +73,7 @@ _TOLERANCE_M = 0.0005  # [m] rounding of positions; source: by hand
 
 @dataclass(frozen=True, slots=True)
 class Neighbour:
-    """Another marker near by."""
+    """Another marker nearby."""
 
     name: str
     # `lon_deg`, `lat_deg`: [deg]
@@ -96,13 +96,13 @@ class Site:
         A value is outside its limits, or a kind of vehicle is unknown.
     """
 
-    design_speed_mps: float | None = None
+    design_speed_mps: float | None = None  # [m/s]
     # [m] of the stop line that the tag announces, on the same line; needs the design speed
     stop_line_chainage_m: float | None = None
     vehicles: tuple[str, ...] = ("sedan", "utility")  # kinds of vehicle to be served, of `vehicle_clearances`
     readable_clearance_m: float = READABLE_CLEARANCE_M  # [m] up to which clearance the decoder reads
-    neighbours: tuple[Neighbour, ...] = field(default=())  # markers near by: of other lanes, of lines, of other tags
-    # `reaction_s`, `deceleration_mps2`: of the driver or the system that acts on the tag
+    neighbours: tuple[Neighbour, ...] = field(default=())  # markers nearby: of other lanes, of lines, of other tags
+    # `reaction_s`, `deceleration_mps2`: [m/s2] of the driver or the system that acts on the tag. [s],
     reaction_s: float = REACTION_S
     deceleration_mps2: float = DECELERATION_MPS2
 

@@ -435,7 +435,7 @@ def _check_log(
         else:
             yield from _compare(entry, 0, _NO_VERSIONS)
         if expected_head is not None and entry.number == expected_head[0] and entry.hash != expected_head[1]:
-            yield Fault(where, "its hash is not the one that was expected: the history up to it was written anew")
+            yield Fault(where, "its hash is not the one that was expected: the history up to it was rewritten")
         number, previous = entry.number, entry.hash
         report.count(entries=1)
         report.head = (number, previous)

@@ -316,7 +316,7 @@ def _extent(table: FeatureTable) -> sa.Select[Any]:
 # putting a hundred features together for each takes longer than all the rest (decision 0006).
 #
 # Whatever writes a marker writes this with it. A property that is added to `FIELDS` needs a migration that writes all
-# texts anew.
+# texts again.
 
 
 PROPERTIES = {field.name: field.column.key or "spec" for field in FIELDS}

@@ -227,7 +227,7 @@ def record_progress(
     steps : (int, int), optional
         Steps that are done, and all.
     kept : bool, optional
-        A part of the result was stored, which the next attempt need not compute: attempts are counted anew.
+        A part of the result was stored, which the next attempt need not compute: attempts are counted from zero again.
     """
     values: dict[str, Any] = {"progress": progress}
     if steps is not None:

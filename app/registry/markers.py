@@ -76,7 +76,7 @@ codebooks = sa.Table(
     sa.Index("ix_codebooks_agency_id_id", "agency_id", "id"),
 )
 
-# which transmissions of a CERPM were heard and when: what is sent again is known by it
+# which transmissions of a CERPM were received and when: what is sent again is known by it
 cerpm_spans = sa.Table(
     "cerpm_spans",
     metadata,
@@ -157,7 +157,7 @@ def list_magnets_in(connection: sa.Connection, box: Box, *, ignoring: str | None
         return fetch_all(connection, query, MagnetRow)
 
 
-# === Queries on CERPMs: their numbers, their agency's secret, and which transmissions were heard.
+# === Queries on CERPMs: their numbers, their agency's secret, and which transmissions were received.
 
 
 _CHUNK = 500
@@ -210,7 +210,7 @@ def list_by_number(connection: sa.Connection, agency_id: str, numbers: Iterable[
 def list_spans(
     connection: sa.Connection, agency_id: str, numbers: Iterable[int], before_decode: str | None = None
 ) -> dict[int, list[SpanRow]]:
-    """What was heard of each of these markers before, or before a decode, in the order it was uploaded."""
+    """What was received of each of these markers before, or before a decode, in the order it was uploaded."""
     query = select_rows(SpanRow, cerpm_spans).where(cerpm_spans.c.agency_id == agency_id).order_by(cerpm_spans.c.row)
     if before_decode is not None:
         query = query.where(cerpm_spans.c.decode_id < before_decode)
@@ -226,9 +226,9 @@ def newest_row(spans: Mapping[int, Sequence[SpanRow]]) -> int:
 
 
 def list_span_ends(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, SpanRow]:
-    """From the first to the last transmission that was ever heard of each of these markers, by number.
+    """From the first to the last transmission that was ever received from each of these markers, by number.
 
-    Only of markers that were heard; `row` is that of the span that was stored last.
+    Only of markers that were received; `row` is that of the span that was stored last.
     """
     wanted, mine = list(numbers), cerpm_spans.c
     first, last = sa.func.min(mine.first_sequence), sa.func.max(mine.last_sequence)
@@ -255,13 +255,13 @@ def list_span_ends(connection: sa.Connection, agency_id: str, numbers: Iterable[
 
 
 def _time_of(end: sa.ColumnElement[bool], heard_s: sa.ColumnElement[float]) -> sa.ColumnElement[float | None]:
-    """When an end was heard first; null where one log that has it had no times."""
+    """When an end was received first; null where one log that has it had no times."""
     untimed = sa.func.count(sa.case((sa.and_(end, heard_s.is_(None)), 1)))
     return sa.case((untimed > 0, None), else_=sa.func.min(sa.case((end, heard_s))))
 
 
 def add_spans(connection: sa.Connection, agency_id: str, decode_id: str, spans: Sequence[Mapping[str, Any]]) -> None:
-    """Keep what a decode heard: number, first_sequence, last_sequence, first_heard_s, last_heard_s of each."""
+    """Keep what a decode received: number, first_sequence, last_sequence, first_heard_s, last_heard_s of each."""
     if spans:
         rows = [{"agency_id": agency_id, "decode_id": decode_id, **span} for span in spans]
         connection.execute(sa.insert(cerpm_spans), rows)

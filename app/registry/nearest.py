@@ -2,7 +2,7 @@
 
 Both look for a radius that holds enough markers, and then take the nearest of all inside it. PostGIS has an order of
 nearness on its GiST index, though one of degrees: what comes first in it is enough where it holds a whole box round the
-farthest that is taken. SQLite's R*Tree has no order: a circle grows until it holds enough. A few near by, which is what
+farthest that is taken. SQLite's R*Tree has no order: a circle grows until it holds enough. A few nearby, which is what
 vehicles and crews ask for, are mostly found by one statement; `list_nearest` finds any number anywhere.
 """
 

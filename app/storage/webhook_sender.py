@@ -192,7 +192,7 @@ class WebhookSender:
     def check_url(self, url: str) -> None:
         """Refuse a URL that cannot be used, as InvalidParameter.
 
-        A name that has no address at the moment is accepted: each delivery resolves it anew.
+        A name that has no address at the moment is accepted: each delivery resolves it again.
         """
         parts = check_url(url, loopback=self._loopback)
         try:

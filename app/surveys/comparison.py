@@ -186,7 +186,7 @@ def find_duplicates(
 ) -> Iterator[Fault]:
     """A fault for a file that was imported before, and one for each row whose marker is registered.
 
-    A row is the same marker if one of its family is registered within the accuracy of the survey, or near by from a row
+    A row is the same marker if one of its family is registered within the accuracy of the survey, or nearby from a row
     with the same point number. Nothing is reported of a comparison, or where duplicates are declared to be stored.
     """
     if declaration.compare or declaration.duplicates == "store" or not known.marker_ids:

@@ -88,7 +88,7 @@ class _Shot(NamedTuple):
 class PlateScenes:
     """Frames with one plate.
 
-    The oracle knows which plates are registered near by, or reads an ArUco tag in the plate's place: what neither
+    The oracle knows which plates are registered nearby, or reads an ArUco tag in the plate's place: what neither
     reads is beyond the limit. The badness of a wrong reading is its confidence, of a missed one its height in rows.
     """
 

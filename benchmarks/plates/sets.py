@@ -104,7 +104,7 @@ class Shot:
     label: str  # where it comes from
     frame: RenderedFrame
     code: PlateCode | None  # on the first face; None where there is no plate
-    codebook: tuple[PlateCode, ...]  # of plates registered near by
+    codebook: tuple[PlateCode, ...]  # of plates registered nearby
     camera: Camera
     # to render it again with other faces, with the ``background`` and the seed of its noise
     scene: PlateScene | None = None

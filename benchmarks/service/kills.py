@@ -90,7 +90,7 @@ def measure_embedded(cycles: int, seed: int, write_s: float = _WRITE_S) -> Resul
 def measure_fleet(
     broker: Broker, cluster: PostgresCluster, cycles: int, seed: int, write_s: float = _WRITE_S
 ) -> Result:
-    """Kill the processes of a fleet, each after at most `write_s`; the database is made anew."""
+    """Kill the processes of a fleet, each after at most `write_s`; the database is made again."""
     cluster.make_database()
     with tempfile.TemporaryDirectory() as folder, _closing(Fleet(Path(folder), broker, cluster)) as service:
         return _measure(service, cycles, seed, write_s)

@@ -140,7 +140,7 @@ class PostgresCluster(_Node):
         self.url = server.set(database="waymark").render_as_string(hide_password=False)
 
     def make_database(self) -> None:
-        """Make the database anew; the cluster has to run."""
+        """Make the database again; the cluster has to run."""
         with _connected(self._server) as connection:
             connection.exec_driver_sql("DROP DATABASE IF EXISTS waymark WITH (FORCE)")
             connection.exec_driver_sql("CREATE DATABASE waymark TEMPLATE template0")

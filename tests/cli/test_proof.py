@@ -54,7 +54,7 @@ def test_a_proof_writes_its_files_and_goes_on_after_an_interruption(folder: Path
     missed = len(fake["passes"])
     assert again["rates"][0]["read"] == document["rates"][0]["read"] - missed  # what the file had was not driven again
     assert len((folder / "proof-units.jsonl").read_bytes().splitlines()) == 5
-    assert prove(folder, "--conditions", "night, day")[0] == 0  # other terms start anew
+    assert prove(folder, "--conditions", "night, day")[0] == 0  # other terms start again
     assert json.loads((folder / "proof.json").read_bytes())["rates"][0]["read"] == 12
 
 

@@ -37,7 +37,7 @@ def test_there_are_three_examples_and_they_are_read() -> None:
 
 
 def test_of_very_many_faults_the_first_are_named() -> None:
-    """Each was once looked up in a schema that was made anew: minutes for this document."""
+    """Each was once looked up in a schema that was made again: minutes for this document."""
     with pytest.raises(InvalidParameter) as caught:
         read_rules(json.dumps({"version": 1, **{f"rule{k}": 1 for k in range(990)}}).encode())
     assert [part.field for part in caught.value.parts] == [f"rule{k}" for k in range(100)]

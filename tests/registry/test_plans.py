@@ -85,7 +85,7 @@ SEARCHES: dict[str, Callable[[sa.Connection, str], object]] = {
     "plates near": lambda c, own: list_near(c, own, ("plate",), 7.0, 0.5, 50.0),
     "over the antimeridian": lambda c, own: list_near(c, own, ("plate",), 180.0, 0.5, 50.0),
     "polygon": lambda c, own: list_markers(c, own, MarkerFilter(area=TRIANGLE), after=None, limit=10),
-    "a few near by": lambda c, own: find_nearest_at_once(c, own, MarkerFilter(), 7.0, 0.5, 10),
+    "a few nearby": lambda c, own: find_nearest_at_once(c, own, MarkerFilter(), 7.0, 0.5, 10),
     "magnets": lambda c, own: list_magnets_in(c, box_around(7.0, 0.5, 2.0)),
 }
 

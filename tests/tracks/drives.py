@@ -97,7 +97,7 @@ class Recording:
             self.see(float(at), **{"source": "upload", **more})  # type: ignore[arg-type]
         return self
 
-    def given(
+    def track_input(
         self, *, samples: bool = True, clocks: tuple[Clock, ...] = (), scale: float = 1.02, bias_deg: float = 1.0
     ) -> TrackInput:
         """All of it, with speeds and headings at 10 Hz by the clock `trace`."""

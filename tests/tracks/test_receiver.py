@@ -40,7 +40,7 @@ def positions(
 def with_outage(truth: Truth) -> TrackInput:
     """Markers every 5 s but for the two minutes in the middle of four."""
     seen = recording(truth).along(5.0, end_s=60.0, clock="trace").along(5.0, start_s=180.0, clock="trace")
-    return seen.given(clocks=CLOCKS)
+    return seen.track_input(clocks=CLOCKS)
 
 
 def errors_m(truth: Truth, track: Track, from_s: float, to_s: float) -> float:
@@ -94,7 +94,7 @@ def test_a_jump_of_the_receiver_is_left_out() -> None:
 
 def test_a_receiver_alone_gives_a_track() -> None:
     truth = drive(120)
-    given = recording(truth).given(clocks=CLOCKS)
+    given = recording(truth).track_input(clocks=CLOCKS)
     track = estimate_track(replace(given, fixes=positions(truth, 0.5)))
     assert errors_m(truth, track, 5, 115) < 1.5
     assert track.fixes == ()

@@ -180,7 +180,7 @@ class CanIn(StrictModel):
 
 
 class TagFormatIn(StrictModel):
-    """Tags to look for where none is registered near by."""
+    """Tags to look for where none is registered nearby."""
 
     magnets: Whole = Field(3, ge=2, le=7)
     length_m: Number = 4.0
@@ -304,7 +304,7 @@ class ContextIn(StrictModel):
         description="Name or id of the vehicle: its profile gives what the context leaves out.",
     )
 
-    def given(self, file_name: str = "") -> ContextInput:
+    def context_input(self, file_name: str = "") -> ContextInput:
         """The members that were sent and nothing else; one that is null is declared to be unknown."""
         stated = self.model_dump(exclude_unset=True, exclude={"vehicle"})
         return ContextInput(stated, self.vehicle, file_name)

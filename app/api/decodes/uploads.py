@@ -104,7 +104,7 @@ async def context_of(text: bytes, file_name: str) -> ContextInput:
     """
     if len(text) > MAX_CONTEXT_BYTES:
         raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
-    return (await read_declaration(ContextIn, text, "context")).given(file_name)
+    return (await read_declaration(ContextIn, text, "context")).context_input(file_name)
 
 
 @asynccontextmanager

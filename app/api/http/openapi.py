@@ -40,7 +40,7 @@ _TAGS = {
     "markers": "Markers of every family: surveyed positions, states, history, bulk writes and searches.",
     "codebooks": "Meanings of magnet tags.",
     "artwork": "Printable plates and signs with proofs of what a camera reads, and drilling sheets of magnet tags.",
-    "cerpms": "Radio markers: keys, frames, and how far they are heard.",
+    "cerpms": "Radio markers: keys, frames, and how far they are received.",
     "plans": "Plans of a road: alignments, rules, placement, proofs, files for crews, and commits.",
     "fleet": "Vehicles, cameras and their calibrations.",
     "uploads": "Files that vehicles send: in one request, resumed, or in parts of an S3 store.",

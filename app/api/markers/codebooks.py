@@ -48,7 +48,7 @@ class DesignIn(StrictModel):
     segment_m: Number = Field(description="Seg_d, the grid of the middle magnets; L is a whole number of it. [m]")
     min_gap_m: Number = Field(0.5, description="Least distance between neighbours, 0.5 or more. [m]", ge=0.5)
 
-    def given(self) -> TagDesign:
+    def tag_design(self) -> TagDesign:
         """The design as the core knows it."""
         with naming("design"):
             return TagDesign(self.magnets, self.length_m, self.segment_m, self.min_gap_m)
@@ -76,7 +76,7 @@ class RulesIn(StrictModel):
         False, description="A code is recognised although one magnet is missed; from M = 4 on."
     )
 
-    def given(self) -> CodebookRules:
+    def codebook_rules(self) -> CodebookRules:
         """The rules as the core knows them."""
         with naming("rules"):
             odometer = OdometerError(**self.odometer.model_dump())
@@ -151,7 +151,7 @@ def post_codebook(wanted: CodebookIn, caller: Caller, codebooks: Service, idempo
     """
     meanings = [meaning.pair for meaning in wanted.meanings]
     document, replayed = codebooks.make(
-        caller, wanted.name, wanted.design.given(), wanted.rules.given(), meanings, idempotency
+        caller, wanted.name, wanted.design.tag_design(), wanted.rules.codebook_rules(), meanings, idempotency
     )
     return created_response(document, replayed, path="/v1/codebooks")
 
@@ -254,4 +254,4 @@ def post_codebook_draft(wanted: CodebookDraftIn, caller: Caller) -> Response:
 
     How many there are, how many fit the rules, and the first 200 of them.
     """
-    return json_response(codebook_draft(wanted.design.given(), wanted.rules.given()))
+    return json_response(codebook_draft(wanted.design.tag_design(), wanted.rules.codebook_rules()))

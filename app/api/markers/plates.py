@@ -222,8 +222,8 @@ class PrintGradeIn(StrictModel):
     camera: CameraRules = Field(default_factory=CameraRules, description="Camera of the vehicles.")
     speed_kmh: Number = Field(60.0, ge=5.0, le=250.0, description="Design speed. [km/h]")
 
-    def given(self) -> PrintDeclaration:
-        """The declaration as the use case knows it.
+    def declaration(self) -> PrintDeclaration:
+        """The declaration as the use case takes it.
 
         Raises
         ------
@@ -288,7 +288,7 @@ async def get_asked(request: Request) -> AsyncIterator[_Asked]:
         photo = form.get("photo")
         if not isinstance(photo, SpooledPart):
             raise UnreadableUpload("there is no photo in the form", field="photo", limit="one file", cure=_CURE)
-        yield _Asked(photo.spooled, (await read_declaration(PrintGradeIn, text, "declaration")).given())
+        yield _Asked(photo.spooled, (await read_declaration(PrintGradeIn, text, "declaration")).declaration())
 
 
 Service = Annotated[PrintGrades, use_case(lambda cases: cases.print_grades)]

@@ -356,7 +356,7 @@ def get_package(
 ) -> Response:
     """Download the package of a plan.
 
-    As it was packed last; 404 if its markers were placed anew since.
+    As it was packed last; 404 if its markers were placed again since.
     """
     package = packages.open(caller, plan_id)
     headers = {"ETag": f'"{package.sha256}"'}
@@ -393,7 +393,7 @@ def post_proof(
 
     The same plan, terms and seed give the same report. A checked plan is `proved` if no reading was wrong; weak markers
     are listed and change nothing. The proof belongs to the markers as they are placed now: if other rules place them
-    anew in the meantime, the plan is not proved.
+    again in the meantime, the plan is not proved.
     """
     return queued_response(*proofs.request(caller, plan_id, terms, version, idempotency))
 

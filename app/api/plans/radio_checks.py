@@ -57,7 +57,7 @@ class PreviewIn(StrictModel):
 class ReceiverIn(StrictModel):
     """The vehicle's receiver."""
 
-    channels: Whole = Field(1, description="Channels heard at once.")
+    channels: Whole = Field(1, description="Channels received at once.")
     sensitivity_dbm: Number | None = Field(None, description="The chip's own if left out. [dBm]")
     capture_db: Number | None = Field(6.0, description="By which a packet outdoes others; null for none. [dB]")
 
@@ -78,7 +78,7 @@ class RadioCheckIn(StrictModel):
     radio: RadioIn = Field(default_factory=RadioIn)
     region: Region = Region.US915
     road: EvenRoadIn = Field(default_factory=lambda: EvenRoadIn())
-    markers: PlacedMarkersIn | None = Field(None, description="In place of `road`: where each stands.")
+    markers: PlacedMarkersIn | None = Field(None, description="In place of `road`: where each is.")
     design_speed_mps: Number = Field(13.4, description="0.5 to 70. [m/s]")
     preview: PreviewIn = Field(default_factory=lambda: PreviewIn())
     receiver: ReceiverIn = Field(default_factory=lambda: ReceiverIn())

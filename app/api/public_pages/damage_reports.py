@@ -82,7 +82,7 @@ def get_damage_report(report_id: ReportId, caller: Caller, reports: Service) -> 
 def get_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Get the photo of a damage report.
 
-    A JPEG that was written anew, without metadata.
+    A JPEG that was written again, without metadata.
     """
     return Response(reports.photo(caller, report_id), headers=_PHOTO_HEADERS, media_type="image/jpeg")
 

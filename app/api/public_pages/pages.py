@@ -104,7 +104,7 @@ _BODY = {
                     "properties": {
                         "kind": {"type": "string", "enum": list(KINDS)},
                         "text": {"type": "string", "maxLength": MAX_TEXT, "description": "What is wrong."},
-                        "photo": {**BINARY, "description": "JPEG or PNG; stored anew, without metadata."},
+                        "photo": {**BINARY, "description": "JPEG or PNG; stored as a new JPEG, without metadata."},
                         "email": {"type": "string", "maxLength": MAX_EMAIL, "description": "For questions; optional."},
                         "website": {"type": "string", "maxLength": 0, "description": "To be left empty."},
                         "token": {"type": "string", "description": "`report.token` of the marker's page."},

@@ -504,7 +504,7 @@ def _match(reading: TagReading, nearby: Sequence[RegisteredTag], before: Sequenc
     if len(found) > 1:
         found = _reachable(reading, found, before) or found
     if not found:
-        return TagMatch(None, note="no tag with this code is registered near by")
+        return TagMatch(None, note="no tag with this code is registered nearby")
     if len(found) > 1:
         note = f"ambiguous: {len(found)} tags within reach have this code"
         return TagMatch(None, tuple(tag.marker_id for tag in found), note)

@@ -37,10 +37,10 @@ much as one that makes them too weak."""
 MAX_REJECTED = 0.5
 """[1] Dipoles that are no magnets, over the sure magnets, from which on the declaration is checked. Source: by hand."""
 PIECE_S = 30.0
-"""[s] of the liveliest piece of a recording that is decoded again. Source: chosen by hand, for speed: thirteen decodes
-take one to three seconds of one core."""
-LIVELY_BLOCK_S = 1.0
-"""[s] of the blocks by whose changes the liveliest piece is found. Source: chosen by hand."""
+"""[s] of the piece of a recording, where the field changes most, that is decoded again: thirteen decodes take one to
+three seconds of one core."""
+CHANGE_BLOCK_S = 1.0
+"""[s] of the blocks by whose changes that piece is found."""
 SPEED_FACTORS = {
     "km/h where m/s was declared": 1 / 3.6, "mph where m/s was declared": 0.44704,
     "m/s where km/h was declared": 3.6, "mph where km/h was declared": 1.609344,
@@ -188,7 +188,7 @@ def compare_with_dipoles(
     Magnets that are read in a wrong unit of the speed look too weak or too strong, all alike: then only a unit in which
     they are as strong as usual is reported.
     """
-    piece = _liveliest_piece(trace, bar)
+    piece = _most_changing_piece(trace, bar)
     declared = _sure_magnets(piece, bar, candidates)
     unlikely = len(declared) >= MIN_MAGNETS and not _is_within(_strength(declared), USUAL_STRENGTH)
     least = (MIN_SHARE if unlikely else MIN_RATIO) * _explained(declared)
@@ -200,9 +200,8 @@ def compare_with_dipoles(
         rank = (_is_within(_strength(found), USUAL_STRENGTH), _explained(found))
         if len(found) < MIN_MAGNETS or rank[1] < least or rank <= best_rank or (unlikely and not rank[0]):
             continue
-        reason = (
-            f"the liveliest {PIECE_S:g} s show {_describe(declared)} as declared, and {_describe(found)} with {what}"
-        )
+        piece_text = f"the {PIECE_S:g} s in which the field changes most"
+        reason = f"{piece_text} show {_describe(declared)} as declared, and {_describe(found)} with {what}"
         cure = f"check {field} of the declaration, and decode the recording again"
         best, best_rank = LikelyMistake(field, reason, cure), rank
     return best
@@ -249,16 +248,16 @@ def _explained(magnets: Sequence[MagnetReading]) -> float:
     return sum(one.snr**2 for one in magnets)
 
 
-def _liveliest_piece(trace: MagnetTrace, bar: MagnetometerBar) -> MagnetTrace:
+def _most_changing_piece(trace: MagnetTrace, bar: MagnetometerBar) -> MagnetTrace:
     """The part of a recording in which the field changes most."""
     duration_s = float(trace.t_s[-1] - trace.t_s[0]) if len(trace.t_s) else 0.0
     if duration_s <= PIECE_S:
         return trace
-    blocks = ((trace.t_s - trace.t_s[0]) / LIVELY_BLOCK_S).astype(int)
+    blocks = ((trace.t_s - trace.t_s[0]) / CHANGE_BLOCK_S).astype(int)
     change = np.nan_to_num(np.abs(np.diff(trace.field_ut[:, bar.array], axis=0)).max(axis=(1, 2)))
     strongest = np.zeros(int(blocks[-1]) + 1)
     np.maximum.at(strongest, blocks[1:], change)
     # magnets are many and alike, so one car that is passed slowly does not decide
     total = np.convolve(np.minimum(strongest, np.quantile(strongest, 0.99)), np.ones(int(PIECE_S)), mode="valid")
-    start_s = float(trace.t_s[0]) + LIVELY_BLOCK_S * int(np.argmax(total))
+    start_s = float(trace.t_s[0]) + CHANGE_BLOCK_S * int(np.argmax(total))
     return trace.between(start_s, start_s + PIECE_S)

@@ -284,7 +284,7 @@ def decode_symbols(
     n : int
         Units along a side.
     codebook : sequence of PlateCode
-        Codes of the plates registered near by.
+        Codes of the plates registered nearby.
     min_confidence : float
         Probability from which digits are returned.
     clean : bool
@@ -305,7 +305,7 @@ def decode_symbols(
     if chosen is not None:
         return chosen
     if read.corrected:
-        return replace(read, code=None, likely=None, reason="corrected digits of no registered plate near by")
+        return replace(read, code=None, likely=None, reason="corrected digits of no registered plate nearby")
     near = min(known, key=lambda code: pattern_cost(evidence, code))
     shown = read.code or read.likely
     if shown is not None and sum(a != b for a, b in zip(near.digits, shown.digits, strict=True)) <= n // 2:

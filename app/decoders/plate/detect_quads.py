@@ -105,7 +105,7 @@ class _Moments(NamedTuple):
 
 
 class _Fourth(NamedTuple):
-    """The fourth marker: its place among the blobs near by (-1 for none), distance from the expected place [sides]."""
+    """The fourth marker: its place among the blobs nearby (-1 for none), distance from the expected place [sides]."""
 
     near: int
     distance: float

@@ -100,7 +100,7 @@ def read_evidence(
         Where the plate is.
     evidence : PlateEvidence
     codebook : sequence of PlateCode
-        Codes of the plates registered near by.
+        Codes of the plates registered nearby.
     verify : callable, optional
         Compares the pixels with a code that the registry does not confirm, where something on the plate is unusual;
         where it cannot, the units decide.

@@ -227,7 +227,7 @@ def decode_plates(
     camera : Camera, optional
         Gives every reading a pose.
     codebook : sequence of PlateCode
-        Codes of the plates registered near by; they decide where the frame alone is uncertain.
+        Codes of the plates registered nearby; they decide where the frame alone is uncertain.
     thermal : bool
         Dark units are warm, that is bright, and there are no colours.
     geometries : sequence of PlateGeometry

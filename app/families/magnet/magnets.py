@@ -45,7 +45,7 @@ from app.families.magnet.layouts import (
     sheet_of,
     worst_grade,
 )
-from app.families.surveys import PLAN_METHOD, Commitment, MarkerRules, PlannedMarkers, PlannedRow, is_placed_anew
+from app.families.surveys import PLAN_METHOD, Commitment, MarkerRules, PlannedMarkers, PlannedRow, is_placed_again
 from app.markers.magnet import MIN_GAP_M, InformationTag, LineStyle, LineTag, Orientation, Tag, parse_tag
 from app.markers.magnet_design import Meaning
 from app.planning.magnet_checks import HALF_BAR_M, Neighbour, Site
@@ -72,7 +72,7 @@ _STRANGER = "a marker of another agency"
 def find_neighbours(
     connection: sa.Connection, agency_id: str, layout: MagnetLayout, *, ignoring: str
 ) -> tuple[Neighbour, ...]:
-    """The nearest magnet near by of each orientation; names of other agencies' markers are kept back.
+    """The nearest magnet nearby of each orientation; names of other agencies' markers are kept back.
 
     Raises
     ------
@@ -308,7 +308,7 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
     def columns(
         self, connection: sa.Connection, registration: Registration, new: NewMagnets, prepared: dict[str, Any]
     ) -> dict[str, Any]:
-        """The columns, with the markers near by.
+        """The columns, with the markers nearby.
 
         Raises
         ------
@@ -339,7 +339,7 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
                 limit="no heading",
                 cure="leave heading_deg out",
             )
-        if not is_placed_anew(row, values):
+        if not is_placed_again(row, values):
             return {}
         spec = resurveyed(row, values["lon_deg"], values["lat_deg"]) if "lon_deg" in values else row.spec
         spec = _with_neighbours(connection, registration.agency_id, row.id, spec)
@@ -425,7 +425,7 @@ def _find_tag(registration: Registration, what: TagInput | LineInput) -> tuple[T
 
 
 def _with_neighbours(connection: sa.Connection, agency_id: str, marker_id: str, spec: MagnetSpec) -> MagnetSpec:
-    """The spec of a marker with the markers near by."""
+    """The spec of a marker with the markers nearby."""
     neighbours = find_neighbours(connection, agency_id, layout_of(marker_id, spec), ignoring=marker_id)
     return {
         **spec,

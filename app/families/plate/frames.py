@@ -57,7 +57,9 @@ class PlateSearch:
     """What to look for in a frame."""
 
     camera: Camera | None = None
-    codebook: tuple[PlateCode, ...] = ()  # plates that the registry knows near by
+    # plates that the registry knows nearby
+    codebook: tuple[PlateCode, ...] = ()  # plates that the registry knows nearby
+    # dimensions to look for; the decoder's own where there are none
     geometries: tuple[PlateGeometry, ...] = ()  # dimensions to look for; the decoder's own where there are none
 
 
@@ -94,9 +96,9 @@ class PlateReadingDocument(TypedDict):
 
     `certainty` is `sure` with `digits`. It is `tentative` with `likely_digits`, which are too unsure to be matched or
     to give a position, and `doubtful_cells`, the cells that may be wrong: other frames of an archive, or a registered
-    plate near by, may confirm them. It is null where there are no digits.
+    plate nearby, may confirm them. It is null where there are no digits.
 
-    `scheme` is that of the registered plate near by with these digits. Without one, `possible_schemes` has all schemes
+    `scheme` is that of the registered plate nearby with these digits. Without one, `possible_schemes` has all schemes
     whose checks the digits satisfy: one check digit holds by accident for one `position` plate in ten, two for one in a
     hundred.
     """
@@ -147,7 +149,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
         self._decode = decode
 
     def search(self, nearby: Nearby, camera: Camera | None) -> PlateSearch:
-        """The codes near by, and their dimensions beside the usual ones."""
+        """The codes nearby, and their dimensions beside the usual ones."""
         geometries = _distinct([*EXPECTED_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)])
         return PlateSearch(camera, plate_codebook(nearby), geometries)
 
@@ -200,7 +202,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
 
 
 def plate_codebook(nearby: Nearby) -> tuple[PlateCode, ...]:
-    """Codes of the plates near by, without repetitions; none if not all of them are known."""
+    """Codes of the plates nearby, without repetitions; none if not all of them are known."""
     return tuple(dict.fromkeys(plate_code(row) for row in nearby.rows)) if nearby.complete else ()
 
 

@@ -16,7 +16,7 @@ from app.families.family import Family, Registration, SnapshotRecord, map_point
 from app.families.plate.frames import PlateArtwork, PlateFrames
 from app.families.plate.inputs import PLATE_EXAMPLES, CodeInput, NewPlate, PlateIn, plate_code, plate_geometry
 from app.families.plate.survey import PlateSurvey
-from app.families.surveys import PLANNED, Commitment, PlannedMarkers, PlannedRow, is_placed_anew
+from app.families.surveys import PLANNED, Commitment, PlannedMarkers, PlannedRow, is_placed_again
 from app.geodesy import PlacedPosition
 from app.markers.plate import PlateCode, PlateScheme, plate_capacity
 from app.planning.outputs.hd_map import MapMarker
@@ -270,7 +270,7 @@ class Plates(Family[NewPlate, PlacedPosition]):
         InvalidParameter, CodeMismatch
             The code contradicts itself or the position.
         CodeTaken
-            Another plate near by carries the code.
+            Another plate nearby carries the code.
         """
         coded = coded_plate(
             new.code, new.geometry.n, (prepared.lon_deg, prepared.lat_deg),
@@ -315,7 +315,7 @@ class Plates(Family[NewPlate, PlacedPosition]):
         CodeTaken
             At its new place, or back in use, its code collides with another plate's.
         """
-        if not is_placed_anew(row, values):
+        if not is_placed_again(row, values):
             return {}
         merged = row._replace(**values)
         code = plate_code(row)

@@ -106,7 +106,7 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
         agency_id: str,
         rules: MarkerRules,
     ) -> bool:
-        """With any plate of the same registry number, or with one near by of the same digits."""
+        """With any plate of the same registry number, or with one nearby of the same digits."""
         if codes.scheme == PlateScheme.ID:
             return known.scheme == "id" and known.n == defaults.geometry.n
         if known.status == RETIRED:

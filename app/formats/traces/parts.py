@@ -313,7 +313,7 @@ def _finite(series: Series, name: str, limits: TraceLimits, report: TraceReport)
 
 
 def coverage(t: Floats, series_t: Floats) -> float:
-    """Share of the samples with a value of a series near by."""
+    """Share of the samples with a value of a series nearby."""
     if not series_t.size or not t.size:
         return 0.0
     after = np.clip(np.searchsorted(series_t, t), 0, series_t.size - 1)

@@ -215,16 +215,16 @@ def _collisions(check: RadioCheck, rules: CerpmRules, busiest: PlannedMarker) ->
 
 
 def _busiest(cerpms: Sequence[PlannedMarker], air: Air) -> tuple[RoadMarkers, PlannedMarker]:
-    """The marker with most others in range, and those around it that can be heard beside it.
+    """The marker with most others in range, and those around it that can be received beside it.
 
     Their distances from it are the true ones, so that a bend does not bring them closer.
     """
     lon, lat = np.array([m.lon_deg for m in cerpms]), np.array([m.lat_deg for m in cerpms])
     tree = scipy.spatial.cKDTree(ecef_from_wgs84(lon, lat))
-    in_range, heard = (
+    in_range, received = (
         tree.query_ball_point(tree.data, away, return_length=True) for away in (air.range_m, air.reach_m + air.harm_m)
     )
-    centre = int(np.lexsort((heard, in_range))[-1])
+    centre = int(np.lexsort((received, in_range))[-1])
     near = np.array(tree.query_ball_point(tree.data[centre], air.reach_m + air.harm_m)[:MAX_MARKERS])
     east = np.radians((lon[near] - lon[centre] + 180.0) % 360.0 - 180.0) * np.cos(np.radians(lat[centre])) * 6_371_000.0
     north = np.radians(lat[near] - lat[centre]) * 6_371_000.0

@@ -86,8 +86,8 @@ def drive_cerpms(one: LanePass) -> LanePath:
     path = fit_lane(LaneMarkers(*(column[used] for column in columns)), simulated.track)
     inside = np.isin(installed.number, list(one.own))
     inside &= (installed.chainage_m + low >= one.from_m) & (installed.chainage_m + low <= one.to_m)
-    heard = np.isin(installed.number[inside], merged.number)
-    return judge_path(path, true, one, low, (int(heard.sum()), int(inside.sum())))
+    received = np.isin(installed.number[inside], merged.number)
+    return judge_path(path, true, one, low, (int(received.sum()), int(inside.sum())))
 
 
 def simulated_radio(settings: RadioSettings) -> Radio:
@@ -130,15 +130,18 @@ def install(one: LanePass, true: TrueLane, low_m: float) -> InstalledMarkers:
     )
 
 
-def judge_path(path: LanePathEstimate, true: TrueLane, one: LanePass, low_m: float, heard: tuple[int, int]) -> LanePath:
+def judge_path(
+    path: LanePathEstimate, true: TrueLane, one: LanePass, low_m: float, received: tuple[int, int]
+) -> LanePath:
     """Distances of the true centre line's places from the path, between the first and the last marker."""
     ends = [at - low_m for marker, at, _ in one.markers if _planned(marker).number in one.own] or [0.0]
     inside = (true.chainage_m >= max(one.from_m - low_m, min(ends))) & (
         true.chainage_m <= min(one.to_m - low_m, max(ends))
     )
     result = LanePath(
-        places=int(inside.sum()), covered=0, square_sum_m2=0.0, worst_m=0.0, worst_at_m=one.from_m, heard=heard[0],
-        markers=heard[1], left_out=sorted({out.number for out in path.left_out}), refusal=path.refusal,
+        places=int(inside.sum()), covered=0, square_sum_m2=0.0, worst_m=0.0, worst_at_m=one.from_m,
+        received=received[0], markers=received[1], left_out=sorted({out.number for out in path.left_out}),
+        refusal=path.refusal,
     )  # fmt: skip
     if path.refusal is not None or len(path.lon_deg) < 2 or not inside.any():
         return result
@@ -217,8 +220,7 @@ class MagnetPass:
     from_m: float
     to_m: float
     tag: PlannedMarker | None  # the tag that is driven over
-    # [m] line magnets near by with chainage and offset on this lane
-    lines: Sequence[tuple[PlannedMarker, float, float]]
+    lines: Sequence[tuple[PlannedMarker, float, float]]  # [m] line magnets nearby with chainage and offset on this lane
     nearby: Sequence[PlannedMarker]  # tags that the vehicle looks for
     left_m: float  # [m] of the vehicle from the lane's centre
     speed_m_s: float

@@ -138,7 +138,7 @@ class PlatePass:
     fps: float
     left_m: float
     rotation_deg: float
-    codebook: Sequence[PlateCode]  # of the plates near by
+    codebook: Sequence[PlateCode]  # of the plates nearby
     survey_error_m: Floats  # shape (2,): [m] east and north of the registered from the true position
     survey_rmse_m: float
     noise_seed: tuple[int, ...]

@@ -49,7 +49,7 @@ class UnitKind(StrEnum):
 class ProofTerms(BaseModel):
     """What is driven, and how. The same plan, terms and seed give the same result.
 
-    `lost_share` of the markers are missing, drawn anew for each drive. Drives take the conditions in turn, and the
+    `lost_share` of the markers are missing, drawn again for each drive. Drives take the conditions in turn, and the
     cameras in turn after each round of conditions. The uncertainty of a survey is radial, as in the registry.
     """
 
@@ -189,8 +189,8 @@ class LanePath(TypedDict):
     square_sum_m2: float
     worst_m: float
     worst_at_m: float  # [m] chainage of the greatest distance
-    # `heard`, `markers`: markers that were received and verified, of those along the stretch
-    heard: int
+    # `received`, `markers`: markers that were received and verified, of those along the stretch
+    received: int
     markers: int
     left_out: list[int]  # numbers of markers that the path leaves out
     refusal: str | None  # why there is no path

@@ -47,7 +47,7 @@ class TraceTerms:
 
     bar: MagnetometerBar
     declaration: TraceDeclaration
-    formats: tuple[TagFormat, ...] = ()  # tags to look for where the registry has none near by
+    formats: tuple[TagFormat, ...] = ()  # tags to look for where the registry has none nearby
     method: str = TRACE_METHODS[0]  # ``matched``, or ``metro`` for the paper's pipeline
     reach_m: float = 2000.0  # [m] how far from the coarse position the drive may lead
 

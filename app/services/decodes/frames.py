@@ -89,7 +89,7 @@ class FrameHandler(UploadHandler[FrameSignal]):
         return False
 
     def start(self, upload: Upload) -> Pending[FrameSignal]:
-        """Hand the frame over, and look up the markers near by while the process loads the picture.
+        """Hand the frame over, and look up the markers nearby while the process loads the picture.
 
         Raises
         ------
@@ -501,7 +501,7 @@ class PendingArchive:
         self._report(total)
 
     def _confirm(self) -> None:
-        """Match plates anew that are tentative in single frames, and that several frames confirm together."""
+        """Match plates again that are tentative in single frames, and that several frames confirm together."""
         places = {frame.index: place for place, frame in enumerate(self._frames)}
         known = self._with_plates
         confirmed = confirm_frames([(index, _plates(known[index][1]) if index in known else ()) for index in places])

@@ -77,7 +77,7 @@ class NearbyMarkers:
 
     @property
     def codebook(self) -> tuple[PlateCode, ...]:
-        """Codes of the plates near by."""
+        """Codes of the plates nearby."""
         return plate_codebook(self.of(PLATE.name))
 
 

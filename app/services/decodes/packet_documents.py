@@ -276,7 +276,7 @@ def _report(files: DriveFiles, read: ReadPackets, result: LaneResult) -> PacketR
     warnings += [*read.verification.warnings, *read.merged.warnings]
     if files.track is not None and _is_of_another_time(files):
         warnings.append(
-            "no packet was heard while the vehicle's track lasts: how far away markers were is not known; the track "
+            "no packet was received while the vehicle's track lasts: how far away markers were is not known; the track "
             "is of another drive, or the clocks do not fit"
         )
     if files.frame is not None and result.overlay is None and not result.lane.refusal:

@@ -183,7 +183,7 @@ def check_not_empty(file: SpooledFile) -> None:
 
 
 def _book_formats(connection: sa.Connection, agency_id: str) -> tuple[TagFormat, ...]:
-    """Formats of the agency's codebooks: what tags look like where none is registered near by."""
+    """Formats of the agency's codebooks: what tags look like where none is registered nearby."""
     rows, _ = CODEBOOKS.page(connection, agency_id, limit=MAX_BOOKS_SEARCHED)
     designs = [book_of(row).design for row in rows]
     return tuple(dict.fromkeys(TagFormat(d.magnets, d.length_m, d.segment_m) for d in designs))

@@ -168,7 +168,7 @@ class TagDocument(TypedDict):
 
 
 class TraceMotionDocument(TypedDict):
-    """Speed and heading at even times from the trace's first sample on; null where the recording has none near by."""
+    """Speed and heading at even times from the trace's first sample on; null where the recording has none nearby."""
 
     start_s: float
     step_s: float

@@ -42,7 +42,7 @@ class TraceMotion:
 
     start_s: float  # trace time of the first value, which is that of the first sample
     step_s: float
-    speed_m_s: tuple[float, ...] = ()  # empty where the recording has none; NaN where it has none near by
+    speed_m_s: tuple[float, ...] = ()  # empty where the recording has none; NaN where it has none nearby
     heading_deg: tuple[float, ...] = ()  # the same
 
 
@@ -80,7 +80,7 @@ def decode_recording(
     declared : mapping
         The declaration as it was sent; see `trace_terms`.
     tags : tuple of str
-        Texts of the information tags that are registered near by.
+        Texts of the information tags that are registered nearby.
     formats : tuple of TagFormat
         Used where there are none.
     limits : TraceLimits

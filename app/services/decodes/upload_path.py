@@ -90,7 +90,7 @@ class Decoded:
 
 
 class OutdatedMatch(Exception):
-    """What an upload was matched against has changed: it has to be matched anew."""
+    """What an upload was matched against has changed: it has to be matched again."""
 
 
 ResultT = TypeVar("ResultT")
@@ -159,7 +159,7 @@ class PendingSignal(Generic[ResultT, SignalT]):
 UPLOADS, PICTURES = "uploads", "pictures"
 """Folders of the blob store."""
 MAX_TRIES = 12
-"""How often an upload is matched anew because another one was stored in between."""
+"""How often an upload is matched again because another one was stored in between."""
 
 
 class UploadPath:

@@ -66,7 +66,7 @@ class Collected:
     warnings: list[str] = field(default_factory=list)
     positions: list[PositionFix] = field(default_factory=list)
 
-    def given(self, survey_m2: Mapping[str, float]) -> TrackInput:
+    def track_input(self, survey_m2: Mapping[str, float]) -> TrackInput:
         """The input of the track, with the survey's variance of each marker. [m2]"""
         fixes = tuple(_with_survey(fix, survey_m2.get(fix.marker_id or "", 0.0)) for fix in self.fixes)
         fixes += tuple(self.positions)
@@ -250,7 +250,7 @@ def _refused(
 ) -> tuple[LeftOutReason | None, str]:
     """Why a matched marker gives no fix."""
     if not match.get("registered"):
-        return LeftOutReason.NOT_REGISTERED, match.get("note") or "no such marker is registered near by"
+        return LeftOutReason.NOT_REGISTERED, match.get("note") or "no such marker is registered nearby"
     if match.get("plausible") is False:
         return LeftOutReason.IMPLAUSIBLE, match.get("note") or "too far from the approximate position"
     if match.get("ambiguous"):

@@ -91,7 +91,7 @@ class Drives:
         found = collect(rows, use_unfit=drive.use_unfit)
         if not found.fixes:
             raise _nothing(rows)
-        check_times(found.given({}))
+        check_times(found.track_input({}))
         job_input = {
             "name": drive.name,
             "decodes": [asdict(entry) for entry in drive.decodes],
@@ -122,7 +122,7 @@ class Drives:
         written = self._processes.run(
             write_track,
             given["name"] or f"drive {job.row.id}",
-            found.given(survey),
+            found.track_input(survey),
             TrackRules(**options),
             tuple(found.left_out),
             tuple(found.on_lane),

@@ -89,7 +89,7 @@ def view_of(context: DecodeContext, frame: ReadFrame) -> VehicleView | None:
 
 
 def frame_health(frame: ReadFrame, context: DecodeContext, nearby: Nearby, at: datetime) -> FrameHealth:
-    """What a frame shows of the health of markers, with the context of its moment and the plates near by."""
+    """What a frame shows of the health of markers, with the context of its moment and the plates nearby."""
     view = view_of(context, frame)
     in_view = {}
     if view is not None and nearby.complete:

@@ -484,7 +484,7 @@ class Maintenance:
             return self._decide(connection, caller, row, "approved", outcome, note, now)
 
     def dismiss(self, caller: Caller, item_id: str, note: str) -> MaintenanceItem:
-        """Reject a suspicion with a reason: its test starts anew, and the item stays in the list of those decided.
+        """Reject a suspicion with a reason: its test starts again, and the item stays in the list of those decided.
 
         Raises
         ------

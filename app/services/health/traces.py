@@ -125,7 +125,7 @@ def missed_cerpms(
 ) -> list[NewObservation]:
     """Markers that the vehicle passed closely, for several transmissions, and of which it received nothing."""
     track = files.track
-    heard = {packet.number for packet in read.verification.packets}
+    received = {packet.number for packet in read.verification.packets}
     if track is None or len(track.time_s) < 2 or not read.signal.profiles:
         return []
     lon_deg, lat_deg = float(np.median(track.lon_deg)), float(np.median(track.lat_deg))
@@ -134,7 +134,7 @@ def missed_cerpms(
         return []
     rows = []
     for row in list_near(connection, agency_id, ("cerpm",), lon_deg, lat_deg, reach_m, limit=MAX_MARKERS):
-        if int(row.digits) in heard or row.status not in _ON_ROAD:
+        if int(row.digits) in received or row.status not in _ON_ROAD:
             continue
         expected = _expected(row, track)
         if expected > 0.0:

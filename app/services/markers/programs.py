@@ -87,7 +87,7 @@ class CerpmPrograms:
         self._secrets = secrets
 
     def payload(self, caller: Caller, marker_id: str, sequence: int | None = None) -> CerpmPayload:
-        """What a marker sends, by default the next transmission after the last that was heard.
+        """What a marker sends, by default the next transmission after the last that was received.
 
         Raises
         ------
@@ -155,7 +155,7 @@ class CerpmPrograms:
 
 
 def _next_sequences(connection: sa.Connection, agency_id: str, rows: list[MarkerRow]) -> dict[int, int]:
-    """The sequence after the last that was heard of each marker, by number."""
+    """The sequence after the last that was received of each marker, by number."""
     numbers = [int(row.digits) for row in rows]
     spans = markers.list_spans(connection, agency_id, numbers)
     following = {n: max((span.last_sequence for span in spans.get(n, ())), default=-1) + 1 for n in numbers}

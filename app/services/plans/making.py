@@ -131,7 +131,7 @@ class PlanPreviews:
         alignment_id : str
         rules : dict
         after : int, optional
-            Markers of the pages before. The first page is always computed anew; the pages after it are those of the
+            Markers of the pages before. The first page is always computed; the pages after it are those of the
             last preview with the same rules, as long as this process keeps it.
         limit : int, optional
             Most markers of the page.

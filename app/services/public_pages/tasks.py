@@ -1,4 +1,4 @@
-"""Photos of damage reports, written anew in a decoder process."""
+"""Photos of damage reports, written again in a decoder process."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ def test_a_track_of_another_day_is_said(road: tuple[httpx.Client, BuiltLane]) ->
     heard, _hour = drive(built, 1915)
     later = replace(heard, track=replace(heard.track, time_s=heard.track.time_s + 86_400.0))
     found = decoded(client, packed(later))
-    assert any("no packet was heard while" in warning for warning in found["report"]["warnings"])
+    assert any("no packet was received while" in warning for warning in found["report"]["warnings"])
     assert all(marker["rssi_profile"] is None for marker in found["markers"])
     assert not any("no packet" in text for text in decoded(client, packed(heard))["report"]["warnings"])
 

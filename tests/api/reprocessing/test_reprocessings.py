@@ -37,7 +37,7 @@ OLD = "waymark 0.1.9 plate/1"
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]) -> Iterator[LiveServer]:
-    """A server whose decoder reads all plates near by, that the tests of this module share."""
+    """A server whose decoder reads all plates nearby, that the tests of this module share."""
     folder = tmp_path_factory.mktemp("reprocessing") / "var"
     url = new_database_url(folder)
     settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, decode_workers=1, **UNLIMITED)

@@ -52,7 +52,7 @@ def piece(shape: str, length: str = "50") -> bytes:
         (document(road(lanes=section(left=LEFT.replace(WIDTH, "")))), "road 7, lane 1 at s 0: the lane has no width"),
         (document(road(lanes=section() + section())), "lane sections are not in the order"),
         (document(road(lanes="")), "no lane that vehicles drive on"),
-        (document(road(), road()), "the road id '7' stands twice"),
+        (document(road(), road()), "the road id '7' occurs twice"),
         (document(road(extra='<type s="0"><speed max="9" unit="knots"/></type>')), "the unit of the speed is 'knots'"),
         (b"<OpenDRIVE/>", "the file has no road"),
         (b"<osm/>", "begins with the element 'osm'"),

@@ -106,7 +106,7 @@ def test_lost_cerpms_are_not_heard(cerpms: Plan) -> None:
     path = prover.prove_unit(unit)["path"]
     assert path is not None
     own = [m for m in cerpms.markers if isinstance(m.detail, PlannedCerpm) and m.lane == unit.lane]
-    assert 0 < path["heard"] <= path["markers"] < len(own)
+    assert 0 < path["received"] <= path["markers"] < len(own)
 
 
 def test_a_long_road_is_sampled_by_strata_and_gaps_are_estimated() -> None:

@@ -253,7 +253,10 @@ def read_opendrive(data: bytes) -> AlignmentFile:
         ids = [road.id for road in roads]
         twice = next(road_id for road_id in ids if ids.count(road_id) > 1)
         raise UnreadableUpload(
-            f"the road id {twice!r} stands twice", field="file", limit="one road per id", cure="number the roads anew"
+            f"the road id {twice!r} occurs twice",
+            field="file",
+            limit="one road per id",
+            cure="give each road an id of its own",
         )
     names = _road_names(roads)
     has_heights = any(len(road.elevation.starts) for road in roads)
