@@ -30,11 +30,11 @@ from app.decoders.plate.detect_quads import (
     MAX_GREENS,
     MAX_QUADS,
     MAX_REDS,
-    QUAD_COLUMNS,
     MarkerQuad,
+    Nearest,
+    Quads,
     join_green_triples,
     join_red_quads,
-    new_nearest,
 )
 from app.decoders.plate.find_candidates import (
     FEATURES,
@@ -173,9 +173,9 @@ def test_no_quadruple_is_dropped_for_its_place_in_the_list() -> None:
     reds, greens = (np.flatnonzero(blobs[:, SIGN] == sign) for sign in (1.0, -1.0))
     assert len(reds) <= MAX_REDS
     assert len(greens) <= MAX_GREENS
-    quads = np.empty((MAX_QUADS, QUAD_COLUMNS))
-    found = join_green_triples(blobs, greens, np.zeros((400, 600), np.int16), new_nearest(), quads)
-    found = join_red_quads(blobs, reds, greens, new_nearest(), quads, found)
+    quads = Quads.empty(MAX_QUADS)
+    found = join_green_triples(blobs, greens, np.zeros((400, 600), np.int16), Nearest.empty(), quads)
+    found = join_red_quads(blobs, reds, greens, Nearest.empty(), quads, found)
     assert found > 1000
-    centroids = np.array([blob[[X, Y]] for blob in plate]).reshape(-1)
-    assert any((np.abs(row[:8] - centroids) < 1e-9).all() for row in quads[:found])
+    centroids = np.array([blob[[X, Y]] for blob in plate])
+    assert any((np.abs(found_px - centroids) < 1e-9).all() for found_px in quads.centroids[:found])
