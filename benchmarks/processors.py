@@ -50,8 +50,7 @@ def uploads() -> dict[str, Callable[[], object]]:
 
     cv2.setNumThreads(1)
     pictures = Path(__file__).resolve().parents[1] / "docs/images"
-    frame = cv2.imread(str(pictures / "frame.jpg"))
-    assert frame is not None
+    frame = np.asarray(cv2.imread(str(pictures / "frame.jpg")), np.uint8)
     empty = np.ascontiguousarray(frame[:, ::-1])
     empty[empty.shape[0] // 3 :] = cv2.GaussianBlur(empty[empty.shape[0] // 3 :], (0, 0), 9)
     archive = (pictures / "drive.zip").read_bytes()

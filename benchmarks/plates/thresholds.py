@@ -10,11 +10,12 @@ import argparse
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import cv2
 
-from app.decoders.plate import decode_symbols, detect_thermal, evidence, reader, unit_likelihoods
+from app.decoders.plate import decode_symbols, detect_thermal, evidence, marker_colours, reader, unit_likelihoods
 from app.decoders.plate.reader import decode_plates
 from benchmarks.plates.evaluate import find_right
 from benchmarks.plates.sets import Job, Shot, read_trials, shoot
@@ -25,7 +26,7 @@ ANY = (-math.inf, math.inf)
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """A threshold by its name in the module that uses it, and the value that takes it out."""
+    """A threshold by its name in the module that uses it (`CONSTANT` or `LIMITS.field`), and the value without it."""
 
     module: object
     name: str
@@ -34,7 +35,7 @@ class Threshold:
     @property
     def value(self) -> object:
         """As it is in the decoder."""
-        return getattr(self.module, self.name)
+        return attrgetter(self.name)(self.module)
 
 
 THRESHOLDS = (
@@ -47,10 +48,10 @@ THRESHOLDS = (
     Threshold(evidence, "MIN_EXPLAINED_SMALL", 0.0),
     Threshold(evidence, "MIN_ROWS_ALONE", 0.0),
     Threshold(evidence, "CLEAN_EXPLAINED", 0.0),
-    Threshold(reader, "MIN_MARGIN_ALONE", -math.inf),
-    Threshold(reader, "MIN_TINT_ALONE", -math.inf),
-    Threshold(reader, "MIN_TRIANGLE_TINT_ALONE", -math.inf),
-    Threshold(reader, "CAST_ALONE", ANY),
+    Threshold(marker_colours, "ALONE.min_margin", -math.inf),
+    Threshold(marker_colours, "ALONE.min_tint", -math.inf),
+    Threshold(marker_colours, "ALONE.min_triangle_tint", -math.inf),
+    Threshold(marker_colours, "ALONE.cast", ANY),
     Threshold(unit_likelihoods, "FULL_WEIGHT_PX", 1e-9),
     Threshold(unit_likelihoods, "MAX_BLUR_UNITS", math.inf),
     Threshold(unit_likelihoods, "CELL_LIGHT_RANGE", ANY),
@@ -66,12 +67,13 @@ THRESHOLDS = (
 @contextmanager
 def without(threshold: Threshold) -> Iterator[None]:
     """The decoder without a threshold."""
-    value = threshold.value
-    setattr(threshold.module, threshold.name, threshold.without)
+    constant, _, field = threshold.name.partition(".")
+    value = getattr(threshold.module, constant)
+    setattr(threshold.module, constant, replace(value, **{field: threshold.without}) if field else threshold.without)
     try:
         yield
     finally:
-        setattr(threshold.module, threshold.name, value)
+        setattr(threshold.module, constant, value)
 
 
 def draw_shots(seed: int, frames: int) -> list[Shot]:

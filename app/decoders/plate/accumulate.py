@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
+from app.decoders.plate.marker_colours import MIN_MARGIN, find_wrong_colour
 from app.decoders.plate.pose import with_pose
-from app.decoders.plate.reader import MIN_MARGIN, wrong_colours
 from app.decoders.plate.unit_likelihoods import (
     LARGE_UNIT_PX,
     MAX_LARGE_RESIDUAL,
@@ -194,4 +194,4 @@ def _usual_missing(evidence: Sequence[PlateEvidence]) -> tuple[PlateOutcome, str
         rest=float(np.median([one.rest for one in colours])),
         beside=float(np.median([one.beside for one in colours])),
     )
-    return usual if joint.margins.min() < MIN_MARGIN else wrong_colours(joint)
+    return usual if joint.margins.min() < MIN_MARGIN else find_wrong_colour(joint)

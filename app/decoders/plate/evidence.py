@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from app.decoders.plate.confirm import UnitVerification
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
-from app.decoders.plate.light_field import MarkerColours
+from app.decoders.plate.marker_colours import MarkerColours
 from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading

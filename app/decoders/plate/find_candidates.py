@@ -13,7 +13,7 @@ import numpy.typing as npt
 from app.compiled import ieee_kernel, step
 from app.decoders.plate.detect_blobs import MarkerSignal, Planes, coarse_ratio_signal, difference_signal, ratio_signal
 from app.decoders.plate.detect_quads import FOUND_ALL, MARKER_RATIO, MarkerQuad, detect_marker_quads
-from app.decoders.plate.light_field import SPOT_PITCH
+from app.decoders.plate.marker_colours import SPOT_PITCH
 from app.decoders.plate.pose import marker_centroids, unit_centres
 from app.markers.plate import SIZES, PlateGeometry
 
@@ -214,7 +214,7 @@ def _sort(values: Floats) -> None:
 
 @step
 def _set_colour_features(view: _View, layout: _Layout, matrix: Floats, features: Floats) -> None:
-    """Set margins, tints and casts, as `marker_colours` defines them."""
+    """Set margins, tints and casts, as `measure_marker_colours` does."""
     height, width = view.opponent.shape
     units = layout.units.shape[0]
     mean = 0.0

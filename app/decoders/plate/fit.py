@@ -8,7 +8,6 @@ first on an image of two or three pixels a unit, then on one of more.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -282,11 +281,18 @@ def _reachable_share(sums: PixelSums, half: Floats, shapes: int) -> float:
     return 1.0 - left / max(variance, 1e-12)
 
 
+class Stage(NamedTuple):
+    """One stage of a fit: how many pixels it uses, and how long it goes on."""
+
+    unit_px: float  # pixels a unit, where the image has more
+    nodes: int  # of the blur's quadrature on each side of the middle
+    max_steps: int
+    is_coarse: bool = False  # the first step finds the values alone, and what is no plate ends early
+    is_skewed: bool = False  # the blur of an upright plate may be skewed against its rows and columns; takes longer
+
+
 @kernel
-def minimize(
-    patch: PlatePatch, model: PlateModel, equations: NormalEquations, max_nodes: int, steps: int, is_coarse: bool,
-    is_skewed: bool,
-) -> FitQuality:  # fmt: skip
+def minimize(patch: PlatePatch, model: PlateModel, equations: NormalEquations, stage: Stage) -> FitQuality:
     """Move pose and values, which change in place, until the corners rest.
 
     Parameters
@@ -295,14 +301,7 @@ def minimize(
     model : PlateModel
     equations : NormalEquations
         Memory for the normal equations; holds those of the last step afterwards.
-    max_nodes : int
-        Nodes of the blur's quadrature on each side of the middle.
-    steps : int
-        At most.
-    is_coarse : bool
-        First stage: the first step finds the values alone, and what is no plate ends early.
-    is_skewed : bool
-        The blur of an upright plate may be skewed against its rows and columns; it takes longer.
+    stage : Stage
 
     Returns
     -------
@@ -315,11 +314,11 @@ def minimize(
     scratch = new_scratch(shapes, model.edges.shape[0])
     area = PatchArea(np.empty(4, np.int64), np.empty(2), np.empty(2))
     quality = FitQuality(False, 0.0, 0.0, 0)
-    for k in range(steps):
+    for k in range(stage.max_steps):
         # the normal equations at the present pose, and what the present values explain
         if not set_corners(model.pose, model.frame, corners) or not _set_area(corners, patch, area):
             return quality
-        quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes, is_skewed)
+        quadrature = blur_quadrature(model.pose, model.frame, patch.grid, stage.nodes, stage.is_skewed)
         sums = set_normal_equations(patch, area, model, quadrature, scratch, equations)
         if sums.pixels < shapes:
             return FitQuality(False, quality.variance, quality.explained, int(sums.pixels))
@@ -327,10 +326,10 @@ def minimize(
         flat = _flat_variance(sums)
         explained = 1.0 - residual2 / max(flat, 1e-12)
         quality = FitQuality(False, max(residual2, GREY_LEVEL * GREY_LEVEL), explained, int(sums.pixels))
-        if not is_coarse and k > 0 and explained < MIN_FINE_EXPLAINED:
+        if not stage.is_coarse and k > 0 and explained < MIN_FINE_EXPLAINED:
             return quality
         # the first step has no values yet, which say how the light moves with the pose
-        values_only = is_coarse and k == 0
+        values_only = stage.is_coarse and k == 0
         _add_priors(equations, model, FLAT_NOISE * flat if values_only else quality.variance)
         if values_only:
             _fix_pose(equations, shapes)
@@ -340,7 +339,7 @@ def minimize(
         half = substitute(factor, equations.rhs)
         # `explained` counts the plate's own pixels only: a lane line may lie beside it
         reachable = max(_reachable_share(sums, half, shapes), explained)
-        if is_coarse and k < len(MIN_COARSE_EXPLAINED) and reachable < MIN_COARSE_EXPLAINED[k]:
+        if stage.is_coarse and k < len(MIN_COARSE_EXPLAINED) and reachable < MIN_COARSE_EXPLAINED[k]:
             return quality
         solution = solve_factorized(factor, half, -model.pose[MOTION])
         for i in range(shapes):
@@ -353,9 +352,9 @@ def minimize(
         move = _move(model.pose, start, solution, model.frame, corners, moved, area.extents)
         if move.shift_px < 0.0:
             return quality
-        if move.shift_px < REST_PX or (is_coarse and move.share < NEAR):
+        if move.shift_px < REST_PX or (stage.is_coarse and move.share < NEAR):
             break
-        if is_coarse and k == steps - 1 and move.share > LOST:
+        if stage.is_coarse and k == stage.max_steps - 1 and move.share > LOST:
             return quality
     return FitQuality(True, quality.variance, quality.explained, quality.pixels)
 
@@ -415,35 +414,30 @@ class PlateFit:
         return math.sqrt(product / max(larger, 1e-300)) / len(self.units)
 
 
-@dataclass(frozen=True, slots=True)
-class _Stage:
-    """Pixels a unit, where the image has more; quadrature nodes on each side of the middle; most steps; whether the
-    blur may be skewed against rows and columns (`profiles`)."""
-
-    unit_px: float
-    nodes: int
-    steps: int
-    is_skewed: bool = False
+_COARSE, _FINE = Stage(1.8, 1, 6, is_coarse=True), Stage(2.8, 4, 4)
+"""Of colour frames: two, then three pixels a unit (decision record 0010, rule 3)."""
+_THERMAL_COARSE, _THERMAL_FINE = Stage(2.4, 2, 6, is_coarse=True), Stage(3.5, 4, 4)
+"""Of thermal frames, whose plates are few and faint."""
+_CORNERS = Stage(4.5, 4, 2, is_skewed=True)
+"""Corners of read plates (decision record 0012); 6 px a unit take 0.7 ms more, and only plates of 48 rows and more gain
+by it."""
 
 
-_QUICK = (_Stage(1.8, 1, 6), _Stage(2.8, 4, 4))
-"""Stages of colour frames. Source: two, then three pixels a unit (decision record 0010, rule 3); steps chosen by
-hand."""
-_THOROUGH = (_Stage(2.4, 2, 6), _Stage(3.5, 4, 4))
-"""Stages of thermal frames, whose plates are few and faint. Source: chosen by hand."""
+class CoarseFit(NamedTuple):
+    """A plate after the first stage: roughly where it is, and what share of its pixels' variance that explains [1]."""
 
-_FINE = _Stage(4.5, 4, 2, is_skewed=True)
-"""Stage of the corners of read plates. Source: decision record 0012; 6 px a unit take 0.7 ms more, and only plates of
-48 rows and more gain by it."""
+    model: PlateModel
+    equations: NormalEquations
+    explained: float
+
+    @property
+    def plate_from_image(self) -> Array:
+        """Homography from pixels to plate coordinates, shape (3, 3)."""
+        return plate_from_image(self.model.pose, self.model.frame)
 
 
 def fit_plate(
-    image: npt.NDArray[Any],
-    centroids_px: Array,
-    geometry: PlateGeometry,
-    *,
-    linear: bool = False,
-    promising: Callable[[Array, float], bool] | None = None,
+    image: npt.NDArray[Any], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
 ) -> PlateFit | None:
     """Fit a plate whose marker centroids are roughly known.
 
@@ -456,40 +450,54 @@ def fit_plate(
     geometry : PlateGeometry
     linear : bool
         The levels are proportional to what is seen, as a thermal camera's; else they are gamma encoded.
-    promising : callable, optional
-        Called after the coarse stage with plate_from_image and the share explained; False ends the fit.
 
     Returns
     -------
     PlateFit or None
         None when the steps leave the image, the plate degenerates, or it explains too little of what is there.
     """
+    coarse = fit_coarsely(image, centroids_px, geometry, linear=linear)
+    return None if coarse is None else finish_fit(image, coarse, geometry, linear=linear)
+
+
+def fit_coarsely(
+    image: npt.NDArray[Any], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
+) -> CoarseFit | None:
+    """First stage of `fit_plate`; most of what is no plate is given up here."""
     model = _start_model(centroids_px, geometry)
     if model is None:
         return None
     equations = _empty_equations(geometry.n, len(model.values))
-    corners = np.empty((4, 2))
-    quality = FitQuality(False, 0.0, 0.0, 0)
-    for number, stage in enumerate(_THOROUGH if linear else _QUICK):
-        is_coarse = number == 0
-        if not set_corners(model.pose, model.frame, corners):
-            return None
-        patch = cut_patch(image, corners, geometry.n * stage.unit_px, linear)
-        if patch is None:
-            return None
-        if is_coarse:
-            model.values[:] = patch.light.mean()
-        quality = minimize(patch, model, equations, stage.nodes, stage.steps, is_coarse, stage.is_skewed)
-        if not quality.is_plate:
-            return None
-        if not is_coarse or promising is None:
-            continue
-        if not promising(plate_from_image(model.pose, model.frame), quality.explained):
-            return None
-    covariance = invert(equations.matrix) * quality.variance
-    if not covariance.size:
+    quality = _run_stage(image, model, equations, _THERMAL_COARSE if linear else _COARSE, linear)
+    return CoarseFit(model, equations, quality.explained) if quality.is_plate else None
+
+
+def finish_fit(
+    image: npt.NDArray[Any], coarse: CoarseFit, geometry: PlateGeometry, *, linear: bool = False
+) -> PlateFit | None:
+    """Second stage of `fit_plate`; it moves the model of the first."""
+    model, equations, _explained = coarse
+    quality = _run_stage(image, model, equations, _THERMAL_FINE if linear else _FINE, linear)
+    if not quality.is_plate:
         return None
-    return _result(model, covariance, equations.misfit, quality)
+    covariance = invert(equations.matrix) * quality.variance
+    return _result(model, covariance, equations.misfit, quality) if covariance.size else None
+
+
+def _run_stage(
+    image: npt.NDArray[Any], model: PlateModel, equations: NormalEquations, stage: Stage, linear: bool
+) -> FitQuality:
+    """Cut the plate out of the image where the model has it, and move the model until its corners rest."""
+    lost = FitQuality(False, 0.0, 0.0, 0)
+    corners = np.empty((4, 2))
+    if not set_corners(model.pose, model.frame, corners):
+        return lost
+    patch = cut_patch(image, corners, len(model.unit_shape) * stage.unit_px, linear)
+    if patch is None:
+        return lost
+    if stage.is_coarse:
+        model.values[:] = patch.light.mean()
+    return minimize(patch, model, equations, stage)
 
 
 def refine_corners(image: npt.NDArray[Any], fit: PlateFit, geometry: PlateGeometry) -> tuple[Array, Array] | None:
@@ -511,14 +519,11 @@ def refine_corners(image: npt.NDArray[Any], fit: PlateFit, geometry: PlateGeomet
     """
     model = fit.model._replace(pose=fit.model.pose.copy(), values=fit.model.values.copy())
     equations = _empty_equations(geometry.n, len(model.values))
-    patch = cut_patch(image, fit.corners_px, geometry.n * _FINE.unit_px, linear=False)
-    if patch is None:
+    quality = _run_stage(image, model, equations, _CORNERS, linear=False)
+    if not quality.is_plate:
         return None
-    quality = minimize(patch, model, equations, _FINE.nodes, _FINE.steps, False, _FINE.is_skewed)
     covariance = invert(equations.matrix) * quality.variance
-    if not quality.is_plate or not covariance.size:
-        return None
-    return _corners(model, covariance, FINE_CORNER_SCATTER)
+    return _corners(model, covariance, FINE_CORNER_SCATTER) if covariance.size else None
 
 
 def _start_model(centroids_px: Array, geometry: PlateGeometry) -> PlateModel | None:

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from app.decoders.plate import reader
 from app.decoders.plate.detect_blobs import (
     AREA,
     COLUMNS,
@@ -29,11 +30,11 @@ from app.decoders.plate.detect_quads import (
     MAX_GREENS,
     MAX_QUADS,
     MAX_REDS,
-    QUAD_COLUMNS,
     MarkerQuad,
+    Nearest,
+    Quads,
     join_green_triples,
     join_red_quads,
-    new_nearest,
 )
 from app.decoders.plate.find_candidates import (
     FEATURES,
@@ -46,7 +47,7 @@ from app.decoders.plate.find_candidates import (
 )
 from app.decoders.plate.fit import homography_from_points, project
 from app.decoders.plate.pose import marker_centroids
-from app.decoders.plate.reader import DEFAULT_GEOMETRIES, MIN_SECOND_LOG_ODDS, _read_candidate, _Task
+from app.decoders.plate.reader import DEFAULT_GEOMETRIES, LIMITS, decode_plates
 from app.markers.plate import PlateCode, PlateGeometry
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import AHEAD_M, face_of, road, shoot, shoot_plate
@@ -119,14 +120,18 @@ def test_the_likeliest_geometry_is_tried_first(n: int) -> None:
     assert candidates[0].log_odds == max(candidate.log_odds for candidate in candidates)
 
 
-@pytest.mark.parametrize(("log_odds", "found"), [(MIN_SECOND_LOG_ODDS, [10]), (MIN_SECOND_LOG_ODDS - 0.1, [])])
-def test_a_poor_fit_of_one_geometry_gives_up_an_unlikely_candidate_only(log_odds: float, found: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("log_odds", "found"), [(LIMITS.min_second_log_odds, [10]), (LIMITS.min_second_log_odds - 0.1, [])]
+)
+def test_a_poor_fit_of_one_geometry_gives_up_an_unlikely_candidate_only(
+    monkeypatch: pytest.MonkeyPatch, log_odds: float, found: list[int]
+) -> None:
     frame = shoot(PlacedFace(face_of(PlateCode.from_position(8.4, 49.0, n=10)), AHEAD_M, 0.0, 0.0))
     quad = true_quad(frame.truths[0].corners_px, PlateGeometry(10))
     candidate = Candidate(quad, (PlateGeometry(12), PlateGeometry(10)), log_odds)
-    task = _Task(frame.image, None, (), DEFAULT_GEOMETRIES)
-    readings = _read_candidate(task, difference_signal(half_planes(frame.image)), candidate)
-    assert [reading.code.n for reading in readings if reading.code] == found
+    signal = difference_signal(half_planes(frame.image))
+    monkeypatch.setattr(reader, "find_candidates", lambda planes, geometries: [(signal, [candidate])])
+    assert [reading.code.n for reading in decode_plates(frame.image) if reading.code] == found
 
 
 def test_the_grid_between_the_markers_counts() -> None:
@@ -168,9 +173,9 @@ def test_no_quadruple_is_dropped_for_its_place_in_the_list() -> None:
     reds, greens = (np.flatnonzero(blobs[:, SIGN] == sign) for sign in (1.0, -1.0))
     assert len(reds) <= MAX_REDS
     assert len(greens) <= MAX_GREENS
-    quads = np.empty((MAX_QUADS, QUAD_COLUMNS))
-    found = join_green_triples(blobs, greens, np.zeros((400, 600), np.int16), new_nearest(), quads)
-    found = join_red_quads(blobs, reds, greens, new_nearest(), quads, found)
+    quads = Quads.empty(MAX_QUADS)
+    found = join_green_triples(blobs, greens, np.zeros((400, 600), np.int16), Nearest.empty(), quads)
+    found = join_red_quads(blobs, reds, greens, Nearest.empty(), quads, found)
     assert found > 1000
-    centroids = np.array([blob[[X, Y]] for blob in plate]).reshape(-1)
-    assert any((np.abs(row[:8] - centroids) < 1e-9).all() for row in quads[:found])
+    centroids = np.array([blob[[X, Y]] for blob in plate])
+    assert any((np.abs(found_px - centroids) < 1e-9).all() for found_px in quads.centroids[:found])

@@ -1,11 +1,11 @@
-"""The fit's two stages, and the look between them."""
+"""The fit's two stages."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from app.decoders.plate.fit import fit_plate, project, refine_corners
+from app.decoders.plate.fit import finish_fit, fit_coarsely, fit_plate, project, refine_corners
 from app.decoders.plate.pose import marker_centroids
 from app.markers.plate import PlateGeometry
 from app.simulation.plate_scene import PlacedFace
@@ -22,21 +22,16 @@ def centroids_px(corners_px: np.ndarray) -> np.ndarray:
     return (1 - u) * (1 - v) * a + u * (1 - v) * b + u * v * c + (1 - u) * v * d
 
 
-@pytest.mark.parametrize("goes_on", [False, True])
-def test_a_candidate_that_is_not_promising_ends_after_the_coarse_stage(goes_on: bool) -> None:
+def test_the_coarse_stage_finds_the_plate_and_the_second_one_explains_more() -> None:
     frame = shoot_plate(turn_deg=20.0)
     corners = frame.truths[0].corners_px
-    asked: list[tuple[np.ndarray, float]] = []
-
-    def promising(plate_from_image: np.ndarray, explained: float) -> bool:
-        asked.append((plate_from_image, explained))
-        return goes_on
-
-    fit = fit_plate(frame.image, centroids_px(corners), GEOMETRY, promising=promising)
-    assert (fit is not None) is goes_on
-    assert len(asked) == 1
-    np.testing.assert_allclose(project(asked[0][0], corners), UNIT_SQUARE, atol=0.05)
-    assert asked[0][1] > 0.9
+    coarse = fit_coarsely(frame.image, centroids_px(corners), GEOMETRY)
+    assert coarse is not None
+    np.testing.assert_allclose(project(coarse.plate_from_image, corners), UNIT_SQUARE, atol=0.05)
+    assert coarse.explained > 0.9
+    fit = finish_fit(frame.image, coarse, GEOMETRY)
+    assert fit is not None
+    np.testing.assert_allclose(project(fit.plate_from_image, corners), UNIT_SQUARE, atol=0.02)
 
 
 def test_the_residual_stands_out_where_a_unit_is_stained() -> None:

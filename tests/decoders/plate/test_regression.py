@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from app.decoders.plate.reader import decode_plates
+from app.decoders.plate.reader import decode_plates, read_plates
 from app.markers.reading import PlateOutcome
 from benchmarks.plates.evaluate import Record, evaluate_job
 from benchmarks.plates.sets import Job, Shot, find_shot, read_trials
@@ -61,6 +61,15 @@ def test_a_look_alike_is_not_read(name: str, index: int, seed: int, number: int,
     readings = decode_plates(shot.frame.image)
     assert [reading.digits for reading in readings if reading.digits] == []
     assert outcome in {reading.outcome for reading in readings}
+
+
+def test_the_evidence_of_a_reading_is_of_the_signal_that_it_was_read_in() -> None:
+    """Red is missing in the difference of the colours, and not in their ratio, in which this plate is read."""
+    shot = find_shot(Job("stress", 0, seed=4711, frames=30), 26)
+    assert isinstance(shot, Shot)
+    ((_reading, evidence),) = [found for found in read_plates(shot.frame.image) if found.reading.code]
+    assert evidence is not None
+    assert evidence.missing is None
 
 
 def test_the_decoder_has_the_thresholds_that_the_benchmark_takes_out() -> None:

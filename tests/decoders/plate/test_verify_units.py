@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy
 
+from app.decoders.plate import reader
 from app.decoders.plate.confirm import UnitVerification
 from app.decoders.plate.detect_blobs import half_planes
 from app.decoders.plate.evidence import MAX_ERROR
@@ -18,7 +19,7 @@ from app.decoders.plate.find_candidates import find_candidates
 from app.decoders.plate.fit import fit_plate, homography_from_points, project
 from app.decoders.plate.hypotheses import LightPrior, PlatePattern, PlatePixels, Spots, set_unit_likelihoods
 from app.decoders.plate.pose import marker_centroids
-from app.decoders.plate.reader import DEFAULT_GEOMETRIES, _decode_colour, _Task, decode_plates
+from app.decoders.plate.reader import DEFAULT_GEOMETRIES, decode_plates
 from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods, verify_units
 from app.markers.plate import PlateCode, PlateGeometry, unit_index
 from app.simulation.plate_face import Face
@@ -93,15 +94,16 @@ def test_small_digits_without_a_check_are_compared_by_their_pixels(
     assert "a stain may hide units" in reading.reason
 
 
-def test_a_plate_that_is_seen_clearly_ends_the_search() -> None:
+def test_a_plate_that_is_seen_clearly_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     row, column = next((int(r), int(c)) for r, c in np.argwhere(PAPER.units == 0) if 2 <= r <= 5 and 2 <= c <= 5)
     frame = shoot(PlacedFace(spotted(row, column, 0.3), AHEAD_M)).image
-    candidates = find_candidates(half_planes(frame), DEFAULT_GEOMETRIES)
+    candidates = list(find_candidates(half_planes(frame), DEFAULT_GEOMETRIES))
     assert sum(bool(found) for _signal, found in candidates) > 1  # other signals show the plate too
-    task = _Task(frame, None, (), DEFAULT_GEOMETRIES)
-    (reading,) = _decode_colour(task)
+    left = iter(candidates)
+    monkeypatch.setattr(reader, "find_candidates", lambda planes, geometries: left)
+    (reading,) = decode_plates(frame)
     assert reading.code is None  # a spot hides a unit, and no other signal shows what is under it
-    assert len(task.evidence) == 1
+    assert len(list(left)) == len(candidates) - 1
 
 
 @pytest.mark.slow
