@@ -63,7 +63,7 @@ class BuiltLane:
 
     lane: TrueLane
     installed: InstalledMarkers
-    markers: list[dict[str, Any]]  # as the registry has them
+    markers: list[dict[str, object]]  # as the registry has them
     keys: dict[int, bytes]  # as the programming station got them
     table: str
 
@@ -167,7 +167,7 @@ def drive_lane_and_judge(
         "file": ("drive.zip", recording, "application/zip"),
         "context": ("context", json.dumps(context).encode(), "application/json"),
     }
-    decode: dict[str, Any] = checked(client.post("/v1/decodes", files=parts)).json()
+    decode: dict[str, object] = checked(client.post("/v1/decodes", files=parts)).json()
     return judge_lane(built, drive, moved, heard, decode), decode, recording, context, list(heard.packets)
 
 

@@ -353,5 +353,5 @@ class ReadReport:
     other_size: int = 0  # frames that have another size than the video
 
 
-def as_uint8(pixels: Any) -> Pixels:
+def as_uint8(pixels: object) -> Pixels:
     return np.asarray(pixels, np.uint8)

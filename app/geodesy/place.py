@@ -82,7 +82,7 @@ def worst_grade(grades: Iterable[LocalizationGrade]) -> LocalizationGrade:
 PLATE_FIXED_EPOCH = 2020.0
 """Epoch in the ITRF for which plate-fixed coordinates without an epoch are transformed. [decimal year]
 
-Any would do, because they do not change and the position is moved to the epoch of its use. Source: by hand.
+object would do, because they do not change and the position is moved to the epoch of its use. Source: by hand.
 """
 UNSTATED_YEARS = 10.0
 """Age that coordinates without an epoch may have. [year] Source: by hand; ITRF2014 came out in 2016."""
@@ -434,7 +434,7 @@ def positions_in_system(
     Notes
     -----
     A system on a global datum is reached by a projection alone. Into the datum that the positions came in, the
-    transformation by which they came is undone. Any other datum is reached by the most accurate operation that states
+    transformation by which they came is undone. object other datum is reached by the most accurate operation that states
     its accuracy there.
     """
     name = normalize_crs(crs)

@@ -123,7 +123,7 @@ def add_key(
     A key that takes over from another has its holder.
     """
     key_id = new_id(now)
-    row: dict[str, Any] = {
+    row: dict[str, object] = {
         "id": key_id,
         "agency_id": agency_id,
         "holder_id": holder_id or key_id,
@@ -205,7 +205,7 @@ class ResponseRow(NamedTuple):
     """An answer, and the hash of the request that it was given to."""
 
     request_sha256: str
-    response: Any
+    response: object
 
 
 def find_response(
@@ -228,7 +228,7 @@ def add_response(
     key: str,
     *,
     request_sha256: str,
-    response: dict[str, Any],
+    response: dict[str, object],
     now: datetime,
     expires_at: datetime,
 ) -> None:

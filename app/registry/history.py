@@ -30,7 +30,7 @@ def list_versions(
         v.marker_id == marker_id, v.agency_id == agency_id, v.version > after
     )
     rows = fetch_all(connection, query.order_by(v.version).limit(limit), VersionRow)
-    return [row._replace(marker=_marker_of(cast(Mapping[str, Any], row.marker))) for row in rows]
+    return [row._replace(marker=_marker_of(cast(Mapping[str, object], row.marker))) for row in rows]
 
 
 def get_version(connection: sa.Connection, agency_id: str, marker_id: str, version: int) -> VersionRow:
@@ -121,7 +121,7 @@ def _states(connection: sa.Connection, marker_ids: list[str], at: datetime) -> I
         yield _marker_of(marker)
 
 
-def _marker_of(stored: Mapping[str, Any]) -> MarkerRow:
+def _marker_of(stored: Mapping[str, object]) -> MarkerRow:
     """The marker of a version; one from before there were grades gets its grade."""
     return row_of(MarkerRow, stored if is_graded(stored) else {**stored, **regraded(stored)})
 

@@ -41,9 +41,9 @@ class CodebookRow(NamedTuple):
 
     id: str
     name: str
-    design: Any
+    design: object
     rules: Any
-    figures: Any
+    figures: object
     entries: Any
     version: int
     created_at: datetime
@@ -76,7 +76,7 @@ class MagnetRow(NamedTuple):
 
 
 def replace_magnets(
-    connection: sa.Connection, agency_id: str, marker_id: str, holes: Sequence[Mapping[str, Any]]
+    connection: sa.Connection, agency_id: str, marker_id: str, holes: Sequence[Mapping[str, object]]
 ) -> None:
     """Store where the magnets of a marker lie: number, lon_deg, lat_deg, polarity, phi_deg of each."""
     connection.execute(
@@ -201,7 +201,7 @@ def _time_of(end: sa.ColumnElement[bool], heard_s: sa.ColumnElement[float]) -> s
     return sa.case((untimed > 0, None), else_=sa.func.min(sa.case((end, heard_s))))
 
 
-def add_spans(connection: sa.Connection, agency_id: str, decode_id: str, spans: Sequence[Mapping[str, Any]]) -> None:
+def add_spans(connection: sa.Connection, agency_id: str, decode_id: str, spans: Sequence[Mapping[str, object]]) -> None:
     """Keep what a decode heard: number, first_sequence, last_sequence, first_heard_s, last_heard_s of each."""
     if spans:
         rows = [{"agency_id": agency_id, "decode_id": decode_id, **span} for span in spans]
@@ -552,7 +552,7 @@ def read_for_snapshot(
     family: str,
     box: Box,
     *,
-    columns: Sequence[sa.ColumnElement[Any]] = (),
+    columns: Sequence[sa.ColumnElement[object]] = (),
     with_retired: bool = False,
 ) -> Iterator[dict[str, tuple[Any, ...]]]:
     """The agency's markers of a family in a box with what vehicles need of them, some at a time, by columns.

@@ -259,7 +259,7 @@ class Package:
             case PartKind.QUALITY:
                 return self._quality(part)
 
-    def manifest(self, entries: list[dict[str, Any]]) -> bytes:
+    def manifest(self, entries: list[dict[str, object]]) -> bytes:
         """The manifest: what was packed, with the name, size and SHA-256 of each file."""
         document = {
             "format": PACKAGE_FORMAT,

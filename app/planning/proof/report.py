@@ -463,7 +463,7 @@ NOTE = (
 """What the figures are, in every document."""
 
 
-def report_document(report: ProofReport) -> dict[str, Any]:
+def report_document(report: ProofReport) -> dict[str, object]:
     """The report as JSON values."""
     return {
         "format": PROOF_FORMAT,
