@@ -11,7 +11,7 @@ import math
 import re
 from collections import Counter
 from functools import partial
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from app.errors import MalformedRequest
 

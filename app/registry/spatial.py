@@ -12,7 +12,6 @@ import math
 import sqlite3
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np

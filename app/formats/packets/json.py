@@ -373,7 +373,9 @@ def read_json(source: PacketSource) -> Iterator[ReceivedPacket]:
             report.leave_out(entry, broken.kind, broken.reason)
 
 
-def _packet_from_record(entry: int, record: Mapping[str, object], source: PacketSource, shapes: _Shapes) -> ReceivedPacket:
+def _packet_from_record(
+    entry: int, record: Mapping[str, object], source: PacketSource, shapes: _Shapes
+) -> ReceivedPacket:
     declaration = source.declaration
     event, outer_time = open_envelope(record)
     kind = find_kind(event)
