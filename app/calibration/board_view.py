@@ -154,7 +154,7 @@ def _steepest_px(grey: Grey) -> float:
     return 2 * float(high - low) / max(min(slopes), 1e-3)
 
 
-def _is_other_board(marks: Any, numbers: Any, board: CalibrationBoard) -> str | None:
+def _is_other_board(marks: Any, numbers: object, board: CalibrationBoard) -> str | None:
     """Why the markers are not this board's: numbers that it does not have, or places that do not fit."""
     found = np.asarray(numbers).ravel()
     known = found < len(board.marker_squares)

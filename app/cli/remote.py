@@ -203,7 +203,7 @@ def artwork(
     """Have a server draw plates, each read back, and write the ZIP."""
     if out.exists():
         raise InvalidParameter(f"{out} already exists", cure="remove it, or choose another name")
-    wanted: dict[str, Any] = {"formats": form} if form else {}
+    wanted: dict[str, object] = {"formats": form} if form else {}
     wanted |= {"marker_ids": marker} if marker else {"status": status}
     with _client(server, key) as client, Progress(quiet=as_json) as shown:
         job = _checked(client.post("/v1/artwork", json=wanted, headers={"Prefer": "respond-async"}))
@@ -301,7 +301,7 @@ def _show_job(shown: Progress, job: dict[str, Any], *, is_done: bool = False) ->
         shown.show(job["kind"], 1.0 if is_done else job["progress"], 1.0)
 
 
-def _events(lines: Iterator[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+def _events(lines: Iterator[str]) -> Iterator[tuple[str, str, dict[str, object]]]:
     import orjson
 
     fields: dict[str, str] = {}
@@ -386,7 +386,7 @@ def _failure(job: dict[str, Any]) -> WaymarkError:
     )
 
 
-def _print_json(document: dict[str, Any]) -> None:
+def _print_json(document: dict[str, object]) -> None:
     import orjson
 
     typer.echo(orjson.dumps(document, option=orjson.OPT_INDENT_2))

@@ -11,7 +11,7 @@ from app.settings import Settings
 _PATH = "/v1/traces"  # https://opentelemetry.io/docs/specs/otlp/#otlphttp-request
 
 
-def start_tracing(settings: Settings, service: str) -> Any:
+def start_tracing(settings: Settings, service: str) -> object:
     """Send spans to the collector of the settings; without one nothing is imported. Returns the provider, or None.
 
     Raises
@@ -53,7 +53,7 @@ class OpenTelemetryTracer:
         self._tracer = provider.get_tracer("waymark")
         self._texts = TraceContextTextMapPropagator()
 
-    def begin(self, name: str, parent: str | None, attributes: dict[str, str]) -> tuple[Any, Any]:
+    def begin(self, name: str, parent: str | None, attributes: dict[str, str]) -> tuple[object, object]:
         """Begin a span, which is the thread's own until `end`."""
         started = self._tracer.start_span(name, context=self._from(parent), attributes=attributes)
         return started, self._context.attach(self._trace.set_span_in_context(started))
@@ -81,5 +81,5 @@ class OpenTelemetryTracer:
         done = self._tracer.start_span(name, context=self._from(parent), attributes=attributes, start_time=began)
         done.end(end_time=ended)
 
-    def _from(self, parent: str | None) -> Any:
+    def _from(self, parent: str | None) -> object:
         return self._texts.extract({"traceparent": parent}) if parent is not None else None

@@ -63,7 +63,7 @@ class BuiltLane:
 
     lane: TrueLane
     installed: InstalledMarkers
-    markers: list[dict[str, Any]]  # as the registry has them
+    markers: list[dict[str, object]]  # as the registry has them
     keys: dict[int, bytes]  # as the programming station got them
     table: str
 

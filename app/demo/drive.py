@@ -102,7 +102,7 @@ SURVEY_HEADING_RMSE_DEG = 0.1
 COARSE_ERROR_M = (2.0, 5.0)
 _ROAD_HEIGHT_M = 165.0
 _FIRST_M, _SPACING_M = 40.0, 28.0
-_CODES: tuple[dict[str, Any], ...] = (
+_CODES: tuple[dict[str, object], ...] = (
     {"scheme": "position-robust"},
     {"scheme": "position-check", "check_digits": 2},
     {"scheme": "position", "digits": PAPER_DIGITS, "allow_mismatched_digits": True},
@@ -117,7 +117,7 @@ class DemoPlate:
     """A plate on the lane: where it truly lies, and how it is registered."""
 
     place: LanePlace
-    body: dict[str, Any]
+    body: dict[str, object]
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class DemoFrame:
     lon_deg: float
     lat_deg: float
     heading_deg: float
-    context: dict[str, Any]  # what is uploaded with the frame: a coarse position some metres off, heading, camera
+    context: dict[str, object]  # what is uploaded with the frame: a coarse position some metres off, heading, camera
 
 
 def list_plates(rng: np.random.Generator) -> list[DemoPlate]:
@@ -140,7 +140,7 @@ def list_plates(rng: np.random.Generator) -> list[DemoPlate]:
     return [DemoPlate(place, _survey(place, code, rng)) for place, code in zip(places, _CODES, strict=True)]
 
 
-def _survey(place: LanePlace, code: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+def _survey(place: LanePlace, code: dict[str, object], rng: np.random.Generator) -> dict[str, object]:
     """The plate as a survey crew registers it: position and heading with the errors of a survey."""
     error_m = rng.standard_normal(3) * SURVEY_RMSE_M / np.sqrt(2)
     lon, lat, height = wgs84_from_enu(error_m, (place.lon_deg, place.lat_deg, _ROAD_HEIGHT_M))

@@ -173,7 +173,7 @@ def build(client: httpx.Client, folder: Path, rng: np.random.Generator) -> Built
     return built
 
 
-def _body(lane: Lane, left_m: float) -> dict[str, Any]:
+def _body(lane: Lane, left_m: float) -> dict[str, object]:
     coordinates = [lane.lon_lat(at, left_m) for at in np.arange(0.0, LENGTH_M + 0.5)]
     geometry = {"type": "LineString", "coordinates": coordinates}
     source = {"height_m": ORIGIN[2], "realization": "ITRF2014", "epoch": 2026.4, "horizontal_rmse_m": 0.02}
@@ -249,10 +249,10 @@ def _pack(drive: SimulatedDrive) -> bytes:
     return packed.getvalue()
 
 
-def _upload(client: httpx.Client, recording: bytes, context: dict[str, Any]) -> dict[str, Any]:
+def _upload(client: httpx.Client, recording: bytes, context: dict[str, Any]) -> dict[str, object]:
     body = json.dumps(context).encode()
     parts = {"file": ("drive.zip", recording, "application/zip"), "context": ("context", body, "application/json")}
-    decode: dict[str, Any] = checked(client.post("/v1/decodes", files=parts)).json()
+    decode: dict[str, object] = checked(client.post("/v1/decodes", files=parts)).json()
     deadline = time.monotonic() + _WAIT_S
     while decode["state"] in ("queued", "running") and time.monotonic() < deadline:
         time.sleep(0.2)
@@ -288,7 +288,7 @@ def _judge_tags(
 ) -> None:
     markers = built.tags[::-1] if result.wrong_way else built.tags
     chainages_m = [tag.chainage_m for tag in drive.tags]
-    claimed: list[dict[str, Any]] = []
+    claimed: list[dict[str, object]] = []
     for number, (marker, placed, at) in enumerate(zip(markers, drive.tags, chainages_m, strict=True)):
         magnets = [magnet for magnet in drive.magnets if magnet.tag == number]
         near = [r for r in readings if abs(r["start_s"] - magnets[0].t_s) * magnets[0].speed_m_s < 1.0]

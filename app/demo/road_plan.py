@@ -32,7 +32,7 @@ _HEAD = ("condition", "read", "passes", "read", "share", "95 % interval")
 class PlanResult:
     """A plan that was placed, checked, costed and proved."""
 
-    plan: dict[str, Any]  # as the server has it
+    plan: dict[str, object]  # as the server has it
     proof: dict[str, Any] = field(default_factory=dict)  # its report
 
     @property

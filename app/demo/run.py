@@ -59,7 +59,7 @@ class _Shown:
     rows: float = 0.0
     decode_id: str = ""
     jpeg: bytes = b""
-    context: dict[str, Any] | None = None
+    context: dict[str, object] | None = None
 
     def offer(self, frame: DemoFrame, decode_id: str) -> None:
         if abs(frame.rows - _SHOWN_ROWS) < abs(self.rows - _SHOWN_ROWS):
@@ -143,7 +143,7 @@ def _demonstrate(client: httpx.Client, out: Path, say: Say) -> tuple[list[Pass],
     say(f"Wrote the artwork, after each plate was rendered and read back: {bundle.headers['Waymark-Proof']}")
     say(f"Simulating drives over them at {SPEED_KMH:g} km/h and {FPS:g} frames a second; uploading each frame ...")
     shown, passes = _Shown(), []
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     for number, (plate, marker) in enumerate(zip(plates, markers, strict=True), 1):
         drive_rng = np.random.default_rng([_SEED, number])
         passes.append(_drive(client, f"{number}", plate, marker, drive_rng, shown, rows))
@@ -170,7 +170,7 @@ def _drive(
     marker: dict[str, Any],
     rng: np.random.Generator,
     shown: _Shown,
-    rows: list[dict[str, Any]],
+    rows: list[dict[str, object]],
 ) -> Pass:
     """Upload the frames of a pass over one plate and compare with the truth."""
     code = registered_code(marker)
@@ -201,11 +201,11 @@ def _drive(
 def _upload(client: httpx.Client, frame: DemoFrame) -> dict[str, Any]:
     context = json.dumps(frame.context).encode()
     parts = {"file": ("frame.jpg", frame.jpeg, "image/jpeg"), "context": ("context", context, "application/json")}
-    decode: dict[str, Any] = checked(client.post("/v1/decodes", files=parts)).json()
+    decode: dict[str, object] = checked(client.post("/v1/decodes", files=parts)).json()
     return decode
 
 
-def _write_results(client: httpx.Client, out: Path, shown: _Shown, rows: list[dict[str, Any]]) -> list[str]:
+def _write_results(client: httpx.Client, out: Path, shown: _Shown, rows: list[dict[str, object]]) -> list[str]:
     with (out / "frames.csv").open("w", newline="") as file:
         names = ("plate", "frame", "rows", "decoded", "position_error_cm", "heading_error_deg")
         writer = csv.DictWriter(file, names)

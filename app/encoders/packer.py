@@ -17,7 +17,7 @@ class Packer:
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
-        self.entries: list[dict[str, Any]] = []
+        self.entries: list[dict[str, object]] = []
 
     def add(self, name: str, content: bytes) -> None:
         """Write a file."""

@@ -21,7 +21,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _HEIGHT_LIMIT_MM = 2**31 - 1
 _STATUS_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 _OPTIONAL = ("lane_lon_deg", "lane_lat_deg", "first_sequence", "last_sequence", "first_heard_s", "last_heard_s")
-Block = Mapping[str, Sequence[Any] | npt.NDArray[Any]]
+Block = Mapping[str, Sequence[object] | npt.NDArray[Any]]
 """Markers by columns: sequences of one length, by the names of `write_snapshot`."""
 
 
@@ -33,7 +33,7 @@ def write_snapshot(
     made_at: datetime,
     expires_at: datetime,
     key: Ed25519PrivateKey,
-    codebooks: Sequence[Mapping[str, Any]] = (),
+    codebooks: Sequence[Mapping[str, object]] = (),
 ) -> bytes:
     """A signed snapshot.
 
@@ -104,7 +104,7 @@ def write_snapshot(
     return signed + key.sign(signed)
 
 
-def kind_text(family: str, kind: Mapping[str, Any]) -> bytes:
+def kind_text(family: str, kind: Mapping[str, object]) -> bytes:
     """What markers of a family have in common, as it is in snapshots; the kind of many markers is made once."""
     return orjson.dumps({"family": family, **kind}, option=orjson.OPT_SORT_KEYS)
 
@@ -157,12 +157,12 @@ def _encoded(block: Block, kinds: dict[bytes, int], codes: Sequence[bytes]) -> d
     return {name: np.asarray(values[name]).astype(form) for name, form in layout.COLUMNS}
 
 
-def _floats(values: Sequence[Any] | npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+def _floats(values: Sequence[object] | npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     """Numbers, NaN where there is none."""
     return np.asarray(values, dtype=np.float64)
 
 
-def _steps(values: Sequence[Any] | npt.NDArray[Any], step: float) -> npt.NDArray[np.int64]:
+def _steps(values: Sequence[object] | npt.NDArray[Any], step: float) -> npt.NDArray[np.int64]:
     """Whole steps, rounded to the even one; 0 where there is no value."""
     return np.rint(np.nan_to_num(_floats(values)) / step).astype(np.int64)
 
@@ -177,7 +177,7 @@ def _headings(heading_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     return np.where(np.isfinite(heading_deg), steps, layout.NO_HEADING)
 
 
-def _rmse(values: Sequence[Any] | npt.NDArray[Any], step: float) -> npt.NDArray[np.int64]:
+def _rmse(values: Sequence[object] | npt.NDArray[Any], step: float) -> npt.NDArray[np.int64]:
     """Steps, rounded up: an accuracy is never shown better than it is."""
     rmse = _floats(values)
     steps = np.minimum(np.ceil(np.nan_to_num(rmse) / step - 1e-6), layout.NO_RMSE - 1)

@@ -82,11 +82,11 @@ def write_csv(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
         yield text.getvalue().encode()
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return "" if value is None else str(value)
 
 
-def _number(value: Any) -> str:
+def _number(value: object) -> str:
     return "" if value is None else repr(value)
 
 
@@ -101,7 +101,7 @@ def write_geojson(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
     yield b"]}"
 
 
-def _feature(record: Record) -> dict[str, Any]:
+def _feature(record: Record) -> dict[str, object]:
     height_m = _ellipsoidal_m(record)
     place = [record["lon_deg"], record["lat_deg"], *([] if height_m is None else [height_m])]
     properties = {name: record[name] for name in FIELDS if name not in ("id", "lon_deg", "lat_deg")}
@@ -168,7 +168,7 @@ def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, a
     return _zipped(folder) if driver == "shapefile" else path
 
 
-def _gis_columns(page: Sequence[Record], *, flat: bool) -> tuple[Any, list[Any]]:
+def _gis_columns(page: Sequence[Record], *, flat: bool) -> tuple[object, list[Any]]:
     """Points as WKB, and the columns of `FIELDS`."""
     values = list(zip(*(record.values() for record in page), strict=True))
     of = dict(zip(page[0], values, strict=True))

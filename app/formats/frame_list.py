@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -118,7 +117,7 @@ def read_frame_list(name: str, data: bytes, declaration: PoseDeclaration | None 
     return FrameList(_without_jumps(listed, report), report)
 
 
-def _csv_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator[tuple[int, dict[str, Any] | None]]:
+def _csv_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator[tuple[int, dict[str, object] | None]]:
     sample = Sample(name, data, declaration.columns)
     if not sample.is_text:
         raise UnreadableUpload(f"{name} is no text", field="file", cure="save the list of frames as CSV")
@@ -137,7 +136,7 @@ def _csv_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator[
         if cells is None:
             yield entry, None
             continue
-        values: dict[str, Any] = {quantity: cells[place].strip() for quantity, place in places.items()}
+        values: dict[str, object] = {quantity: cells[place].strip() for quantity, place in places.items()}
         try:
             for quantity in ("lon", "lat", "heading", "accuracy"):
                 if quantity in values:
@@ -148,7 +147,7 @@ def _csv_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator[
         yield entry, values
 
 
-def _json_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator[tuple[int, dict[str, Any] | None]]:
+def _json_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator[tuple[int, dict[str, object] | None]]:
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -166,7 +165,7 @@ def _json_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator
         yield entry, {quantity: cells[place] for quantity, place in places.items()}
 
 
-def _frame_of(values: Mapping[str, Any], declaration: PoseDeclaration) -> ListedFrame:
+def _frame_of(values: Mapping[str, object], declaration: PoseDeclaration) -> ListedFrame:
     def number(quantity: str) -> float:
         value = values.get(quantity)
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e9:

@@ -11,7 +11,7 @@ import math
 import re
 from collections import Counter
 from functools import partial
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from app.errors import MalformedRequest
 
@@ -28,7 +28,7 @@ _EMPTY = re.compile(rb"[\[{][ \t\r\n]*+[\]}]")
 _TEXT = re.compile(rb'"(?:[^"\\]|\\.)*+(?:"|\Z)', re.DOTALL)
 
 
-def parse_json(raw: bytes, field: str = "body") -> Any:
+def parse_json(raw: bytes, field: str = "body") -> object:
     """Parse JSON, refusing what the standard or the store cannot hold. The time is linear in the size.
 
     Parameters
@@ -65,7 +65,7 @@ def parse_json(raw: bytes, field: str = "body") -> Any:
     return value
 
 
-def check_values(root: Any, field: str) -> None:
+def check_values(root: object, field: str) -> None:
     """Check that a value that was read from a text, as YAML, is one that JSON can hold; in linear time.
 
     Raises
@@ -125,7 +125,7 @@ def _count_marks(raw: bytes) -> int:
     return raw.count(b",") + raw.count(b"[") + raw.count(b"{")
 
 
-def _unique(pairs: list[tuple[str, Any]], field: str) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, object]], field: str) -> dict[str, object]:
     if len(pairs) > MAX_MEMBERS:
         _refuse(f"an object has {len(pairs)} members", field, f"{MAX_MEMBERS} members of an object")
     found = dict(pairs)
@@ -159,7 +159,7 @@ class _Step:
         return _printable(".".join(reversed(names)))
 
 
-def _is_deep(root: Any) -> bool:
+def _is_deep(root: object) -> bool:
     """Whether there are more than `MAX_DEPTH` levels: level by level, which costs a tenth of a walk with paths."""
     level = [root]
     for _depth in range(MAX_DEPTH):

@@ -527,7 +527,7 @@ def _has_fix(kind: str, sentence: Any) -> bool:
     return sentence.status == "A" and mode not in ("N", "S", "M")  # none, simulated, typed in by hand
 
 
-def _heading_of_ths(sentence: Any) -> object:
+def _heading_of_ths(sentence: object) -> object:
     """Heading of a THS sentence; None if it is simulated, estimated or typed in."""
     if getattr(sentence, "mi", "A") != "A":
         return None

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import cv2
 import numpy as np
@@ -353,5 +353,5 @@ class ReadReport:
     other_size: int = 0  # frames that have another size than the video
 
 
-def as_uint8(pixels: Any) -> Pixels:
+def as_uint8(pixels: object) -> Pixels:
     return np.asarray(pixels, np.uint8)

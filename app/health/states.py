@@ -293,6 +293,6 @@ class VehicleState:
         """Standard deviation of the shift, each axis. [m]"""
         return math.hypot(SHIFT_PRIOR_M / math.sqrt(1.0 + self.offsets), SHIFT_FLOOR_M)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """The state as JSON values."""
         return asdict(self)

@@ -522,7 +522,7 @@ def _checked_value(kind: MeaningKind, value: float | str) -> float | str:
     return value
 
 
-def check_name(field: str, text: Any) -> None:
+def check_name(field: str, text: object) -> None:
     """Refuse what is not a printable line of text."""
     plain = isinstance(text, str) and 1 <= len(text) <= MAX_NAME and text.isprintable() and text == text.strip()
     if not plain:
@@ -577,7 +577,7 @@ class Codebook:
         """The code of a meaning, or None if it has none."""
         return next((tag for tag, known in self.entries if known == meaning), None)
 
-    def to_document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, object]:
         """As plain values, for JSON."""
         design = self.design
         return {

@@ -496,7 +496,7 @@ def _unreadable(message: str, cure: str) -> UnreadableUpload:
 # --- values ---------------------------------------------------------------------------------------------------------
 
 
-def _invalid(error: ValidationError, document: Mapping[Any, Any]) -> InvalidParameter:
+def _invalid(error: ValidationError, document: Mapping[object, object]) -> InvalidParameter:
     """One error a place; the first is raised and has all of them as parts."""
     found: dict[str, InvalidParameter] = {}
     for detail in islice(error.errors(include_url=False, include_context=False), _MAX_FAULTS):

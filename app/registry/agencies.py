@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import sqlalchemy as sa
 
@@ -180,7 +180,7 @@ def add_key(
     A key that takes over from another has its holder.
     """
     key_id = new_id(now)
-    row: dict[str, Any] = {
+    row: dict[str, object] = {
         "id": key_id,
         "agency_id": agency_id,
         "holder_id": holder_id or key_id,
@@ -262,7 +262,7 @@ class ResponseRow(NamedTuple):
     """An answer, and the hash of the request that it was given to."""
 
     request_sha256: str
-    response: Any
+    response: object
 
 
 def find_response(
@@ -285,7 +285,7 @@ def add_response(
     key: str,
     *,
     request_sha256: str,
-    response: dict[str, Any],
+    response: dict[str, object],
     now: datetime,
     expires_at: datetime,
 ) -> None:

@@ -89,8 +89,8 @@ class AuditEntry:
     _hashes: Any = field(default_factory=hashlib.sha256)
 
     def version(
-        self, marker_id: str, version: int, marker: Mapping[str, Any], *, kind: str, why: str | None
-    ) -> dict[str, Any]:
+        self, marker_id: str, version: int, marker: Mapping[str, object], *, kind: str, why: str | None
+    ) -> dict[str, object]:
         """A version of a marker as a row of `marker_versions`, counted and covered by this entry.
 
         Raises
@@ -174,19 +174,19 @@ def version_sha256(
     who: str,
     why: str | None,
     kind: str,
-    marker: orjson.Fragment | Mapping[str, Any],
+    marker: orjson.Fragment | Mapping[str, object],
 ) -> str:
     """Hash of a version: SHA-256 of these values as a JSON array with sorted keys (RFC 8259, no spaces)."""
     values = (agency_id, marker_id, version, at.astimezone(UTC), who, why, kind, marker)
     return content_sha256(values)
 
 
-def content_sha256(content: Any) -> str:
+def content_sha256(content: object) -> str:
     """SHA-256 of a value as JSON with sorted keys."""
     return hashlib.sha256(orjson.dumps(content, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 
-def entry_hash(entry: Mapping[str, Any] | sa.RowMapping) -> str:
+def entry_hash(entry: Mapping[str, object] | sa.RowMapping) -> str:
     """Hash of an entry: SHA-256 of all its other columns as a JSON array, the hash before it among them."""
     values = [entry[column.name] for column in audit_log.c if column.name != "hash"]
     return content_sha256(values)
@@ -201,7 +201,7 @@ def recording(
     *,
     now: datetime,
     subject: str | None = None,
-    detail: Mapping[str, Any] | None = None,
+    detail: Mapping[str, object] | None = None,
 ) -> Iterator[AuditEntry]:
     """Append an entry to the agency's chain when the block ends; versions written in the block belong to it.
 
@@ -246,14 +246,14 @@ def record(
     *,
     now: datetime,
     subject: str | None = None,
-    detail: Mapping[str, Any] | None = None,
+    detail: Mapping[str, object] | None = None,
 ) -> None:
     """Append an entry for a change that writes no versions of markers; parameters as `recording`."""
     with recording(connection, agency_id, author, action, now=now, subject=subject, detail=detail):
         pass
 
 
-def add_versions(connection: sa.Connection, versions: list[dict[str, Any]]) -> None:
+def add_versions(connection: sa.Connection, versions: list[dict[str, object]]) -> None:
     """Store rows that `AuditEntry.version` made."""
     connection.execute(sa.insert(marker_versions), versions)
 
@@ -584,7 +584,7 @@ def _check_newest(connection: sa.Connection, agency_id: str, since: int) -> Iter
             yield Fault(f"marker {version.marker_id}", what)
 
 
-def _differing(now: dict[str, Any], marker: dict[str, Any]) -> list[str]:
+def _differing(now: dict[str, object], marker: dict[str, object]) -> list[str]:
     """Columns of the marker that its newest version has otherwise; a version knows the columns of its time."""
     if "localization_grade" in marker and not is_graded(marker):
         marker = {**marker, **regraded(marker)}  # a migration did the same

@@ -34,10 +34,10 @@ class Columns:
 
     count: int  # rows
     same: dict[str, Any]  # columns in which all rows agree: name to value
-    own: dict[str, Sequence[Any]]  # the others: name to `count` values; of JSON columns either values or `JsonTexts`
+    own: dict[str, Sequence[object]]  # the others: name to `count` values; of JSON columns either values or `JsonTexts`
 
     @classmethod
-    def of(cls, count: int, same: Mapping[str, Any], lists: Mapping[str, Sequence[Any]]) -> Columns:
+    def of(cls, count: int, same: Mapping[str, object], lists: Mapping[str, Sequence[object]]) -> Columns:
         """Columns from lists; a list whose values are all the same becomes one shared value."""
         alike = {name for name, values in lists.items() if not isinstance(values, JsonTexts) and _is_one_value(values)}
         return cls(
@@ -46,7 +46,7 @@ class Columns:
             {name: values for name, values in lists.items() if name not in alike},
         )
 
-    def but(self, **lists: Sequence[Any]) -> Columns:
+    def but(self, **lists: Sequence[object]) -> Columns:
         """A copy with other values in some columns."""
         return Columns.of(
             self.count,
@@ -99,7 +99,7 @@ def json_objects(columns: Columns, *, names: Sequence[str] | None = None, option
     return JsonTexts(["{" + (members % row)[1:] + "}" for row in zip(*texts, strict=True)])
 
 
-def json_texts(values: Sequence[Any]) -> Sequence[str]:
+def json_texts(values: Sequence[object]) -> Sequence[str]:
     """Each value as JSON with sorted keys."""
     if isinstance(values, JsonTexts):
         return values
@@ -109,11 +109,11 @@ def json_texts(values: Sequence[Any]) -> Sequence[str]:
     return [_text(value) for value in values]
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return orjson.dumps(value, option=orjson.OPT_SORT_KEYS).decode()
 
 
-def _is_one_value(values: Sequence[Any]) -> bool:
+def _is_one_value(values: Sequence[object]) -> bool:
     """Whether all values are equal and of one type: 0 is not False."""
     first = values[0] if values else None
     return bool(values) and list(values).count(first) == len(values) and len(set(map(type, values))) == 1
@@ -132,7 +132,7 @@ _MAX_VALUES = 30_000
 _RTREE_TRIGGER = "markers_rtree_insert"
 
 
-def load_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping[str, Any]]) -> None:
+def load_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping[str, object]]) -> None:
     """Insert rows that all have the same columns.
 
     JSON columns take values, or `orjson.Fragment` of what is JSON already; times are aware.
@@ -156,7 +156,7 @@ def load_columns(connection: sa.Connection, table: sa.Table, columns: Columns) -
     _load(connection, table, Columns(columns.count, same, own))
 
 
-def _stored(connection: sa.Connection, table: sa.Table, name: str, values: Sequence[Any]) -> Sequence[Any]:
+def _stored(connection: sa.Connection, table: sa.Table, name: str, values: Sequence[object]) -> Sequence[object]:
     """Values as the driver takes them."""
     kind = table.c[name].type
     if isinstance(kind, sa.JSON):
@@ -330,7 +330,7 @@ def _copy_text(columns: Columns) -> str:
     return same.join(map("\t".join, zip(*own, strict=True))) + same
 
 
-def _copy_value(value: Any) -> str:
+def _copy_value(value: object) -> str:
     if isinstance(value, str):
         return value.replace("\\", "\\\\").replace("\t", "\\t").replace("\n", "\\n").replace("\r", "\\r")
     if isinstance(value, bytes):
@@ -353,7 +353,7 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(f'"{name}"' for name in names)
 
 
-def _json(value: Any) -> str | None:
+def _json(value: object) -> str | None:
     return None if value is None else orjson.dumps(value).decode()
 
 

@@ -105,7 +105,7 @@ def new_id(now: datetime) -> str:
 # costs as much as SQLAlchemy's own row.
 
 
-RowT = TypeVar("RowT", bound=tuple[Any, ...])
+RowT = TypeVar("RowT", bound=tuple[object, ...])
 _CHUNK = 500
 _TIMES = ("created_at", "updated_at")
 
@@ -120,9 +120,9 @@ def select_rows(row: type[RowT], table: sa.FromClause) -> sa.Select[Any]:
     return sa.select(*columns_of(row, table))
 
 
-def row_maker(row: type[RowT]) -> Callable[[Iterable[Any]], RowT]:
+def row_maker(row: type[RowT]) -> Callable[[Iterable[object]], RowT]:
     """What makes a row from the values of its columns."""
-    return cast("Callable[[Iterable[Any]], RowT]", row._make)  # type: ignore[attr-defined]
+    return cast("Callable[[Iterable[object]], RowT]", row._make)  # type: ignore[attr-defined]
 
 
 def row_of(row: type[RowT], values: Any) -> RowT:
@@ -132,14 +132,14 @@ def row_of(row: type[RowT], values: Any) -> RowT:
 
 
 def fetch_all(
-    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], values: Mapping[str, Any] | None = None
+    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], values: Mapping[str, object] | None = None
 ) -> list[RowT]:
     """All rows that a query returns."""
     return list(map(row_maker(row), connection.execute(query, values)))
 
 
 def fetch_in(
-    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], column: sa.Column[Any], values: Iterable[Any]
+    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], column: sa.Column[Any], values: Iterable[object]
 ) -> Iterator[RowT]:
     """The rows of a query that have one of many values in a column, some values at a time."""
     wanted = list(values)
@@ -148,7 +148,7 @@ def fetch_in(
 
 
 def find_one(
-    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], values: Mapping[str, Any] | None = None
+    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], values: Mapping[str, object] | None = None
 ) -> RowT | None:
     """The only row that a query returns; None if there is none."""
     found = connection.execute(query, values).one_or_none()

@@ -39,12 +39,12 @@ def grade_columns(horizontal_rmse_m: float | None, accuracy_m: float | None, not
     }
 
 
-def is_graded(values: Mapping[str, Any]) -> bool:
+def is_graded(values: Mapping[str, object]) -> bool:
     """Whether a row or a version has a grade; older ones are ``exact`` or ``approximate``."""
     return values.get("localization_grade") in list(LocalizationGrade)
 
 
-def regraded(values: Mapping[str, Any]) -> dict[str, Any]:
+def regraded(values: Mapping[str, Any]) -> dict[str, object]:
     """The columns of the grade of a row or a version that has none.
 
     Parameters
@@ -138,7 +138,7 @@ def condition_sql(condition: Condition, columns: dict[str, sa.ColumnElement[Any]
             return result
 
 
-def holds(condition: Condition, values: Mapping[str, Any]) -> bool | None:
+def holds(condition: Condition, values: Mapping[str, object]) -> bool | None:
     """Whether the condition holds of these values by their properties' names, as `condition_sql` has it; None of what
     is unknown.
     """
@@ -184,12 +184,12 @@ class _Bytewise(FunctionElement[str]):
 
 
 @compiles(_Bytewise, "sqlite")
-def _plain(element: _Bytewise, compiler: SQLCompiler, **how: Any) -> str:
+def _plain(element: _Bytewise, compiler: SQLCompiler, **how: object) -> str:
     return compiler.process(next(iter(element.clauses)), **how)
 
 
 @compiles(_Bytewise, "postgresql")
-def _in_c(element: _Bytewise, compiler: SQLCompiler, **how: Any) -> str:
+def _in_c(element: _Bytewise, compiler: SQLCompiler, **how: object) -> str:
     return f'({compiler.process(next(iter(element.clauses)), **how)} COLLATE "C")'
 
 
@@ -200,19 +200,19 @@ class _Like(FunctionElement[bool]):
     type = sa.Boolean()
     inherit_cache = True
 
-    def self_group(self, against: Any = None) -> _Like:
+    def self_group(self, against: object = None) -> _Like:
         """Itself: SQLAlchemy would compare it with 1."""
         return self
 
 
 @compiles(_Like, "sqlite")
-def _by_glob(element: _Like, compiler: SQLCompiler, **how: Any) -> str:
+def _by_glob(element: _Like, compiler: SQLCompiler, **how: object) -> str:
     text, _, pattern = element.clauses
     return f"({compiler.process(text, **how)} GLOB {compiler.process(pattern, **how)})"
 
 
 @compiles(_Like, "postgresql")
-def _by_like(element: _Like, compiler: SQLCompiler, **how: Any) -> str:
+def _by_like(element: _Like, compiler: SQLCompiler, **how: object) -> str:
     text, pattern, _ = element.clauses
     return f"({compiler.process(text, **how)} LIKE {compiler.process(pattern, **how)} ESCAPE '\\')"
 

@@ -92,7 +92,7 @@ class NewObservation(NamedTuple):
     detail: dict[str, Any]
 
 
-_JOB_COLUMNS: dict[str, sa.ColumnElement[Any]] = {
+_JOB_COLUMNS: dict[str, sa.ColumnElement[object]] = {
     "state": sa.func.coalesce(jobs.c.state, "done"),
     "progress": sa.func.coalesce(jobs.c.progress, 1.0),
     "attempts": sa.func.coalesce(jobs.c.attempts, 1),
@@ -164,7 +164,7 @@ def list_decodes(
 
 def store_result(
     connection: sa.Connection, agency_id: str, decode_id: str,
-    *, result: Mapping[str, Any], picture_key: str | None, now: datetime,
+    *, result: Mapping[str, object], picture_key: str | None, now: datetime,
 ) -> None:  # fmt: skip
     """Store the result of a decode that was queued, in the transaction that finishes its job."""
     own = sa.update(decodes).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
@@ -172,7 +172,7 @@ def store_result(
     connection.execute(own.values(result=result, picture_key=picture_key, finished_at=now, decoder=decoder))
 
 
-def store_part(connection: sa.Connection, agency_id: str, decode_id: str, result: Mapping[str, Any]) -> None:
+def store_part(connection: sa.Connection, agency_id: str, decode_id: str, result: Mapping[str, object]) -> None:
     """Store the result so far of a decode that runs."""
     own = sa.update(decodes).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
     connection.execute(own.values(result=result))

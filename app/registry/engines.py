@@ -220,7 +220,7 @@ def sqlite_asking_engine(url: sa.URL) -> sa.Engine:
     return _sqlite_engine(url, "query_only = ON", pool_reset_on_return=None)
 
 
-def _sqlite_engine(url: sa.URL, *pragmas: str, **options: Any) -> sa.Engine:
+def _sqlite_engine(url: sa.URL, *pragmas: str, **options: object) -> sa.Engine:
     engine = sa.create_engine(
         url,
         connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
@@ -233,7 +233,7 @@ def _sqlite_engine(url: sa.URL, *pragmas: str, **options: Any) -> sa.Engine:
     )
 
     @event.listens_for(engine, "connect")
-    def configure(connection: Any, _record: Any) -> None:
+    def configure(connection: Any, _record: object) -> None:
         connection.isolation_level = None  # the driver starts no transaction of its own
         register_functions(connection)
         for pragma in pragmas:
@@ -250,7 +250,7 @@ def postgres_asking_engine(url: sa.URL) -> sa.Engine:
     """
     import psycopg  # here: a server on SQLite loads none of it
 
-    class BinaryCursor(psycopg.Cursor[Any]):
+    class BinaryCursor(psycopg.Cursor[object]):
         """A cursor that returns numbers and times in binary, not as text."""
 
         def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -313,7 +313,7 @@ def postgres_engine(url: sa.URL) -> sa.Engine:
     return engine
 
 
-def isolation(url: sa.URL, *, write: bool) -> dict[str, Any]:
+def isolation(url: sa.URL, *, write: bool) -> dict[str, object]:
     """Execution options of a connection's next transaction."""
     if url.get_backend_name() == "sqlite":
         return {WRITE: write}
@@ -379,5 +379,5 @@ def _temporary(error: Exception) -> Unavailable | None:
     return Unavailable(message, cure="try again in a few seconds")
 
 
-def _json(value: Any) -> str:
+def _json(value: object) -> str:
     return orjson.dumps(value).decode()

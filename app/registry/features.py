@@ -85,10 +85,10 @@ class FeatureTable:
     fields: tuple[Field, ...]
     owned: sa.ColumnElement[bool]  # which rows of the table they are
     text: sa.ColumnElement[Any]  # the feature as GeoJSON, in one line
-    changed: sa.ColumnElement[Any]  # time of the last change
+    changed: sa.ColumnElement[object]  # time of the last change
     tiled: tuple[str, ...]  # fields that points in tiles have
     cheap_to_count: frozenset[str]  # fields by which rows are counted in little time
-    epoch: sa.ColumnElement[Any] | None = None  # [decimal year] coordinate epoch of a row
+    epoch: sa.ColumnElement[object] | None = None  # [decimal year] coordinate epoch of a row
     plans: sa.Table | None = None  # what the columns refer to besides: the plan of each row
 
     @property
@@ -99,7 +99,7 @@ class FeatureTable:
         return self.table.join(self.plans, self.plans.c.id == self.table.c.plan_id)
 
     @cached_property
-    def columns(self) -> dict[str, sa.ColumnElement[Any]]:
+    def columns(self) -> dict[str, sa.ColumnElement[object]]:
         """Columns by the names of their properties."""
         return {field.name: field.column for field in self.fields}
 
@@ -108,9 +108,9 @@ class FeatureTable:
         """An agency's rows, by the parameter `agency`."""
         return [self.table.c.agency_id == sa.bindparam("agency"), self.owned]
 
-    def values(self, connection: sa.Connection, agency_id: str) -> dict[str, Any]:
+    def values(self, connection: sa.Connection, agency_id: str) -> dict[str, object]:
         """Values of the parameters that all statements have."""
-        values: dict[str, Any] = {"agency": agency_id}
+        values: dict[str, object] = {"agency": agency_id}
         if self.plans is not None:
             states = find_plan_states(connection, agency_id)
             values |= {name: sorted(getattr(states, name)) for name in states._fields}
@@ -221,7 +221,7 @@ def _shape(filtered: FeatureFilter, after: bool) -> _Shape:
     )
 
 
-def _values(connection: sa.Connection, agency_id: str, filtered: FeatureFilter) -> dict[str, Any]:
+def _values(connection: sa.Connection, agency_id: str, filtered: FeatureFilter) -> dict[str, object]:
     values = filtered.table.values(connection, agency_id)
     for k, box in enumerate(filtered.box.parts if filtered.box is not None else ()):
         values |= {f"w{k}": box.west_deg, f"s{k}": box.south_deg, f"e{k}": box.east_deg, f"n{k}": box.north_deg}
@@ -361,7 +361,7 @@ def feature_texts(columns: Columns) -> list[str]:
         f"{lon},{lat}" if is_flat or height == "null" else f"{lon},{lat},{height}"
         for (lon, lat, height), is_flat in zip(places, flat, strict=True)
     )
-    members: dict[str, Sequence[Any]] = {
+    members: dict[str, Sequence[object]] = {
         "id": columns.values("id"),
         "geometry": JsonTexts([f'{{"type":"Point","coordinates":[{place}]}}' for place in coordinates]),
         "properties": json_objects(properties, names=tuple(PROPERTIES)),

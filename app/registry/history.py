@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime
-from typing import Any, cast
+from typing import cast
 
 import sqlalchemy as sa
 
@@ -29,7 +29,7 @@ def list_versions(
         v.marker_id == marker_id, v.agency_id == agency_id, v.version > after
     )
     rows = fetch_all(connection, query.order_by(v.version).limit(limit), VersionRow)
-    return [row._replace(marker=_marker_of(cast(Mapping[str, Any], row.marker))) for row in rows]
+    return [row._replace(marker=_marker_of(cast(Mapping[str, object], row.marker))) for row in rows]
 
 
 def get_version(connection: sa.Connection, agency_id: str, marker_id: str, version: int) -> VersionRow:
@@ -120,7 +120,7 @@ def _states(connection: sa.Connection, marker_ids: list[str], at: datetime) -> I
         yield _marker_of(marker)
 
 
-def _marker_of(stored: Mapping[str, Any]) -> MarkerRow:
+def _marker_of(stored: Mapping[str, object]) -> MarkerRow:
     """The marker of a version; one from before there were grades gets its grade."""
     return row_of(MarkerRow, stored if is_graded(stored) else {**stored, **regraded(stored)})
 

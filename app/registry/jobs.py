@@ -135,7 +135,7 @@ class UnfinishedJob(NamedTuple):
 
 def new_job(
     kind: JobKind, job_id: str, agency_id: str, holder_id: str, now: datetime,
-    *, job_input: Mapping[str, Any] | None = None, upload_key: str | None = None, subject_id: str | None = None,
+    *, job_input: Mapping[str, object] | None = None, upload_key: str | None = None, subject_id: str | None = None,
 ) -> JobRow:  # fmt: skip
     """A job that waits to be started."""
     return JobRow(
@@ -229,7 +229,7 @@ def record_progress(
     kept : bool, optional
         A part of the result was stored, which the next attempt need not compute: attempts are counted from zero again.
     """
-    values: dict[str, Any] = {"progress": progress}
+    values: dict[str, object] = {"progress": progress}
     if steps is not None:
         values["steps_done"], values["steps_total"] = steps
     if kept:
@@ -259,7 +259,7 @@ def request_cancel(
 
 def finish_job(
     connection: sa.Connection, job_id: str, state: JobState, now: datetime,
-    *, result: Mapping[str, Any] | None = None, error: Mapping[str, object] | None = None,
+    *, result: Mapping[str, object] | None = None, error: Mapping[str, object] | None = None,
     subject_id: str | None = None, dead_letter: bool = False,
 ) -> bool:  # fmt: skip
     """Record how a job ended, unless it has ended before. Returns whether it did now.
@@ -269,7 +269,7 @@ def finish_job(
     dead_letter : bool, optional
         It stopped the processes that worked on it, so it is not to be run again as it is.
     """
-    values: dict[str, Any] = {
+    values: dict[str, object] = {
         "state": state, "finished_at": now, "result": result, "error": error, "dead_letter": dead_letter,
         "lease_until": None,
     }  # fmt: skip
@@ -318,7 +318,7 @@ def list_ended(connection: sa.Connection, kinds: Sequence[JobKind], before: date
     return fetch_all(connection, query.order_by(jobs.c.id), JobRow)
 
 
-def replace_result(connection: sa.Connection, job_id: str, result: Mapping[str, Any]) -> None:
+def replace_result(connection: sa.Connection, job_id: str, result: Mapping[str, object]) -> None:
     """Store another result of a job that is done."""
     connection.execute(sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state == "done").values(result=dict(result)))
 

@@ -53,7 +53,7 @@ class Line:
     """A line of markers: its id, its properties, and its points as longitude and latitude [deg]."""
 
     id: str
-    properties: dict[str, Any]
+    properties: dict[str, object]
     points: list[tuple[float, float]]
 
 
@@ -78,7 +78,7 @@ class LineSource(Protocol):
         agency_id: str,
         *,
         box: Box | None,
-        pinned: Mapping[str, Any],
+        pinned: Mapping[str, object],
         after: LinePlace | None,
     ) -> Iterator[Line]:
         """The agency's lines in a fixed order, from the one after a place on."""
@@ -93,7 +93,7 @@ def read_lines(
     sources: Mapping[str, LineSource],
     *,
     box: Box | None = None,
-    pinned: Mapping[str, Any] | None = None,
+    pinned: Mapping[str, object] | None = None,
     after: str | None = None,
 ) -> Generator[Line]:
     """The agency's lines, family by family in the order of the sources.
@@ -281,7 +281,7 @@ def _is_before(row: Any, begin: Any, *, or_at: bool) -> bool:
     return bool(at <= limit if or_at else at < limit)
 
 
-def _cut(rows: Iterable[Any], is_before: Callable[[Any], bool]) -> Iterator[list[Any]]:
+def _cut(rows: Iterable[Any], is_before: Callable[[object], bool]) -> Iterator[list[object]]:
     """Runs of rows in the order of roads and measures, but those that begin before; each as soon as it is complete."""
     begun: deque[_Run] = deque()
     growing: dict[str, _Run] = {}
@@ -309,7 +309,7 @@ def _is_complete(run: _Run, growing: Mapping[str, _Run], row: Any) -> bool:
     return growing.get(last.side) is not run or row.measure_m - last.measure_m > MAX_GAP_M
 
 
-def _wanted(run: _Run) -> Iterator[list[Any]]:
+def _wanted(run: _Run) -> Iterator[list[object]]:
     if run.is_wanted and len(run.rows) >= 2:
         yield run.rows
 
@@ -340,7 +340,7 @@ class MagnetLines:
         agency_id: str,
         *,
         box: Box | None,
-        pinned: Mapping[str, Any],
+        pinned: Mapping[str, object],
         after: LinePlace | None,
     ) -> Iterator[Line]:
         """Lines in the order of their ids."""

@@ -146,7 +146,7 @@ class MarkerRow(NamedTuple):
     instrument: str | None
     survey_file_sha256: str | None
     transform_accuracy_m: float | None
-    original: dict[str, Any]
+    original: dict[str, object]
     localization_grade: Grade
     transform_note: str | None
     road: str | None

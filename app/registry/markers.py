@@ -100,9 +100,9 @@ class CodebookRow(NamedTuple):
 
     id: str
     name: str
-    design: Any
+    design: object
     rules: Any
-    figures: Any
+    figures: object
     entries: Any
     version: int
     created_at: datetime
@@ -135,7 +135,7 @@ class MagnetRow(NamedTuple):
 
 
 def replace_magnets(
-    connection: sa.Connection, agency_id: str, marker_id: str, holes: Sequence[Mapping[str, Any]]
+    connection: sa.Connection, agency_id: str, marker_id: str, holes: Sequence[Mapping[str, object]]
 ) -> None:
     """Store where the magnets of a marker lie: number, lon_deg, lat_deg, polarity, phi_deg of each."""
     connection.execute(
@@ -611,7 +611,7 @@ def read_for_snapshot(
     family: str,
     box: Box,
     *,
-    columns: Sequence[sa.ColumnElement[Any]] = (),
+    columns: Sequence[sa.ColumnElement[object]] = (),
     with_retired: bool = False,
 ) -> Iterator[dict[str, tuple[Any, ...]]]:
     """The agency's markers of a family in a box with what vehicles need of them, some at a time, by columns.

@@ -90,7 +90,7 @@ def find_nearest_at_once(
     limit = 10 + math.ceil(3 * count / max(math.cos(math.radians(lat_deg)), 0.1))
     filtered = replace(filtered, near=None)
     if connection.dialect.name == "postgresql":
-        values: dict[str, Any] = {"agency": agency_id, "most": limit, "lon": lon_deg, "lat": lat_deg}
+        values: dict[str, object] = {"agency": agency_id, "most": limit, "lon": lon_deg, "lat": lat_deg}
         rows = connection.execute(_in_order(filtered, True), values).all()
     else:
         parts = box_around(lon_deg, lat_deg, min(_FIRST_M, max_m)).parts

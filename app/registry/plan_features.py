@@ -78,12 +78,12 @@ class _JsonText(FunctionElement[str]):
 
 
 @compiles(_JsonText, "sqlite")
-def _by_json_quote(element: _JsonText, compiler: SQLCompiler, **how: Any) -> str:
+def _by_json_quote(element: _JsonText, compiler: SQLCompiler, **how: object) -> str:
     return f"json_quote({compiler.process(element.clauses, **how)})"
 
 
 @compiles(_JsonText, "postgresql")
-def _by_to_json(element: _JsonText, compiler: SQLCompiler, **how: Any) -> str:
+def _by_to_json(element: _JsonText, compiler: SQLCompiler, **how: object) -> str:
     return f"to_json(({compiler.process(element.clauses, **how)})::text)::text"
 
 
@@ -200,7 +200,7 @@ class AlignmentLanes:
 
 
 def add_lanes(
-    connection: sa.Connection, agency_id: str, alignment_id: str, lanes: Sequence[tuple[dict[str, Any], list[Any]]]
+    connection: sa.Connection, agency_id: str, alignment_id: str, lanes: Sequence[tuple[dict[str, object], list[Any]]]
 ) -> None:
     """Store the properties and the points [lon, lat] of the lanes of a new alignment."""
     rows = [
@@ -230,6 +230,6 @@ def _near(box: Box | None) -> list[sa.ColumnElement[bool]]:
     return [sa.or_(*parts)]
 
 
-def _line(lane_id: str, properties: dict[str, Any], points: list[Any], alignment: str) -> Line:
+def _line(lane_id: str, properties: dict[str, object], points: list[tuple[float, float]], alignment: str) -> Line:
     named = {"alignment_id": lane_id.partition(".")[0], "alignment": alignment, **properties}
     return Line(lane_id, named, [(lon, lat) for lon, lat in points])

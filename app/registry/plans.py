@@ -58,13 +58,13 @@ proof_units = sa.Table(
 # === Queries on finished units of proofs, from which an interrupted proof goes on.
 
 
-def add_unit(connection: sa.Connection, agency_id: str, job_id: str, number: int, result: Mapping[str, Any]) -> None:
+def add_unit(connection: sa.Connection, agency_id: str, job_id: str, number: int, result: Mapping[str, object]) -> None:
     """Store the result of a unit that is not stored yet."""
     values = {"job_id": job_id, "number": number, "agency_id": agency_id, "result": dict(result)}
     connection.execute(sa.insert(proof_units).values(values))
 
 
-def list_units(connection: sa.Connection, agency_id: str, job_id: str) -> dict[int, dict[str, Any]]:
+def list_units(connection: sa.Connection, agency_id: str, job_id: str) -> dict[int, dict[str, object]]:
     """Results of the finished units of a job, by the units' numbers."""
     c = proof_units.c
     query = sa.select(c.number, c.result).where(c.job_id == job_id, c.agency_id == agency_id)
@@ -102,7 +102,7 @@ class PlanRow(NamedTuple):
     alignment_id: str
     name: str
     status: str
-    rules: dict[str, Any]
+    rules: dict[str, object]
     document_key: str
     summary: dict[str, Any]
     proof: dict[str, Any] | None

@@ -236,7 +236,7 @@ def list_reports(
     return [_row(found) for found in connection.execute(query.order_by(_R.id.desc()).limit(limit))]
 
 
-def change_report(connection: sa.Connection, agency_id: str, report_id: str, **values: Any) -> None:
+def change_report(connection: sa.Connection, agency_id: str, report_id: str, **values: object) -> None:
     """Set columns of a report."""
     own = sa.update(damage_reports).where(_R.id == report_id, _R.agency_id == agency_id)
     connection.execute(own.values(**values))

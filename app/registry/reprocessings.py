@@ -85,10 +85,10 @@ class ReprocessedRow(NamedTuple):
     agency_id: str
     decoder_before: str | None
     decoder: str | None
-    result: dict[str, Any] | None
+    result: dict[str, object] | None
     picture_key: str | None
-    error: dict[str, Any] | None
-    changes: list[dict[str, Any]]
+    error: dict[str, object] | None
+    changes: list[dict[str, object]]
     gained: int
     lost: int
     changed: int
@@ -99,7 +99,7 @@ class StoredDecode(NamedTuple):
     """What decides whether an upload is decoded again."""
 
     id: str
-    context: dict[str, Any]
+    context: dict[str, object]
     decoder: str | None
 
 

@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from app.errors import Conflict, NotFound, StaleVersion
 from app.registry.column_types import fetch_all, find_one, new_id, select_rows
 
-RowT = TypeVar("RowT", bound=tuple[Any, ...])
+RowT = TypeVar("RowT", bound=tuple[object, ...])
 
 
 class VersionRow(NamedTuple):
@@ -22,7 +22,7 @@ class VersionRow(NamedTuple):
     at: datetime
     who: str
     why: str | None
-    stored: Any
+    stored: object
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Resource(Generic[RowT]):
     versions: sa.Table | None = None  # the history. Its columns `{name}_id` and `{name}` have the id and the resource.
     unversioned: tuple[str, ...] = ()  # columns that no version keeps
 
-    def find(self, connection: sa.Connection, agency_id: str, **equal: Any) -> RowT | None:
+    def find(self, connection: sa.Connection, agency_id: str, **equal: object) -> RowT | None:
         """The only resource whose columns have these values."""
         return find_one(connection, self._select(agency_id, equal), self.row)
 
@@ -93,7 +93,7 @@ class Resource(Generic[RowT]):
         limit: int,
         newest_first: bool = False,
         where: Sequence[sa.ColumnElement[bool]] = (),
-        **equal: Any,
+        **equal: object,
     ) -> tuple[list[RowT], str | None]:
         """Resources in the order of their ids, which is the order they were made in, or newest first.
 
@@ -139,7 +139,7 @@ class Resource(Generic[RowT]):
         connection: sa.Connection,
         agency_id: str,
         resource_id: str,
-        changes: Mapping[str, Any],
+        changes: Mapping[str, object],
         *,
         version: int,
         now: datetime,
@@ -196,7 +196,7 @@ class Resource(Generic[RowT]):
         assert self.versions is not None, f"no history is kept of a {self.name}"
         return self.versions
 
-    def _select(self, agency_id: str, equal: Mapping[str, Any]) -> sa.Select[Any]:
+    def _select(self, agency_id: str, equal: Mapping[str, object]) -> sa.Select[Any]:
         c = self.table.c
         return select_rows(self.row, self.table).where(
             c.agency_id == agency_id, *(c[name] == value for name, value in equal.items())
@@ -217,7 +217,7 @@ class Resource(Generic[RowT]):
         return row  # type: ignore[no-any-return]
 
 
-def first_version(now: datetime) -> dict[str, Any]:
+def first_version(now: datetime) -> dict[str, object]:
     """Columns of a new resource: its id, its version and its times."""
     return {"id": new_id(now), "version": 1, "created_at": now, "updated_at": now}
 

@@ -12,7 +12,6 @@ import math
 import sqlite3
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -251,7 +250,7 @@ class _Proposed(FunctionElement[bool]):
     type = sa.Boolean()
     inherit_cache = True
 
-    def self_group(self, against: Any = None) -> _Proposed:
+    def self_group(self, against: object = None) -> _Proposed:
         """Itself: SQLAlchemy would write `... IN (...) = 1` for SQLite, which then ignores the index."""
         return self
 
@@ -268,7 +267,7 @@ def proposed_by_index(
 
 
 @compiles(_Proposed, "sqlite")
-def _by_rtree(element: _Proposed, compiler: SQLCompiler, **how: Any) -> str:
+def _by_rtree(element: _Proposed, compiler: SQLCompiler, **how: object) -> str:
     row, west, south, east, north = element.clauses
     index = _RTREES[row.table.name]
     rows = sa.select(index.c.row).where(
@@ -278,7 +277,7 @@ def _by_rtree(element: _Proposed, compiler: SQLCompiler, **how: Any) -> str:
 
 
 @compiles(_Proposed, "postgresql")
-def _by_gist(element: _Proposed, compiler: SQLCompiler, **how: Any) -> str:
+def _by_gist(element: _Proposed, compiler: SQLCompiler, **how: object) -> str:
     row, *sides = element.clauses
     point = sa.table(row.table.name, sa.column("geom")).c.geom
     box = sa.func.ST_MakeEnvelope(*sides, sa.literal_column("4326"))
@@ -316,19 +315,19 @@ class _Covered(FunctionElement[bool]):
     type = sa.Boolean()
     inherit_cache = True
 
-    def self_group(self, against: Any = None) -> _Covered:
+    def self_group(self, against: object = None) -> _Covered:
         """Itself; see `_Proposed`."""
         return self
 
 
 @compiles(_Covered, "sqlite")
-def _by_function(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
+def _by_function(element: _Covered, compiler: SQLCompiler, **how: object) -> str:
     _wkb, key = element.clauses
     return compiler.process(sa.func.waymark_covers(key, markers.c.lon_deg, markers.c.lat_deg), **how)
 
 
 @compiles(_Covered, "postgresql")
-def _by_postgis(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
+def _by_postgis(element: _Covered, compiler: SQLCompiler, **how: object) -> str:
     wkb, _key = element.clauses
     area = sa.func.ST_GeomFromWKB(wkb, sa.literal_column("4326"))
     point = sa.table("markers", sa.column("geom")).c.geom

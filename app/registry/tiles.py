@@ -209,7 +209,7 @@ def feature_tile(
     Both databases write the same, but for the last digits of headings.
     """
     box = tile.box(margin_px)
-    values: dict[str, Any] = {**table.values(connection, agency_id), "most": MAX_FEATURES}
+    values: dict[str, object] = {**table.values(connection, agency_id), "most": MAX_FEATURES}
     values |= {"w0": box.west_deg, "s0": box.south_deg, "e0": box.east_deg, "n0": box.north_deg}
     if connection.dialect.name == "postgresql":
         place = {"size": 2.0**tile.zoom, "column": float(tile.column), "row": float(tile.row), "layer": layer}

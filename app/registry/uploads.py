@@ -191,7 +191,7 @@ def delete_parts(connection: sa.Connection, agency_id: str, upload_id: str) -> N
     connection.execute(sa.delete(upload_parts).where(_P.upload_id == upload_id, _P.agency_id == agency_id))
 
 
-def end_upload(connection: sa.Connection, agency_id: str, upload_id: str, state: str, **values: Any) -> None:
+def end_upload(connection: sa.Connection, agency_id: str, upload_id: str, state: str, **values: object) -> None:
     """Give an upload its last state, and forget its parts."""
     query = sa.update(uploads).where(_U.id == upload_id, _U.agency_id == agency_id)
     connection.execute(query.values(state=state, lock_id=None, locked_until=None, **values))

@@ -97,7 +97,7 @@ class EventRow(NamedTuple):
     kind: str  # for example ``maintenance.suspect``
     subject_id: str | None  # what it is about: an id of the resource that the kind names
     at: datetime
-    detail: dict[str, Any] | None  # small JSON values, without anything secret
+    detail: dict[str, object] | None  # small JSON values, without anything secret
 
 
 def add_event(
@@ -107,7 +107,7 @@ def add_event(
     *,
     subject_id: str | None,
     at: datetime,
-    detail: Mapping[str, Any] | None = None,
+    detail: Mapping[str, object] | None = None,
 ) -> None:
     """Store an event, in the transaction in which it happens."""
     connection.execute(
@@ -239,7 +239,7 @@ def delete_webhook(connection: sa.Connection, webhook_id: str) -> None:
     connection.execute(sa.delete(webhooks).where(_W.id == webhook_id))
 
 
-def change_webhook(connection: sa.Connection, webhook_id: str, **values: Any) -> None:
+def change_webhook(connection: sa.Connection, webhook_id: str, **values: object) -> None:
     """Set columns of a webhook."""
     connection.execute(sa.update(webhooks).where(_W.id == webhook_id).values(**values))
 
@@ -283,7 +283,7 @@ def get_delivery(connection: sa.Connection, webhook_id: str, delivery_id: str) -
     return row
 
 
-def change_delivery(connection: sa.Connection, delivery_id: str, **values: Any) -> None:
+def change_delivery(connection: sa.Connection, delivery_id: str, **values: object) -> None:
     """Set columns of a delivery."""
     connection.execute(sa.update(webhook_deliveries).where(_D.id == delivery_id).values(**values))
 

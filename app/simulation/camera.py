@@ -80,15 +80,15 @@ def accumulate_face(
     rays: Any,
     samples: Any,
     row_time_s: Any,
-    motion: Any,
-    spin: Any,
+    motion: object,
+    spin: object,
     height_m: float,
     face_from_ground: Any,
     reflectance: Any,
     emission: Any,
     light: Any,
-    shade: Any,
-    shade_from_ground: Any,
+    shade: object,
+    shade_from_ground: object,
     out: Any,
     cover: Any,
 ) -> None:  # pragma: no cover - compiled
@@ -168,12 +168,12 @@ def _ground(
 
 @kernel
 def _misses(
-    ray: Any,
+    ray: object,
     row_time_s: float,
     begin: float,
     end: float,
-    motion: Any,
-    spin: Any,
+    motion: object,
+    spin: object,
     height_m: float,
     face_from_ground: Any,
     size: int,
@@ -209,7 +209,7 @@ def _bilinear(field: Any, field_from_ground: Any, gx: float, gy: float) -> float
 
 @kernel
 def shade_rays(
-    rays: Any, height_m: float, shade: Any, shade_from_ground: Any, out: Any
+    rays: Any, height_m: float, shade: object, shade_from_ground: object, out: Any
 ) -> None:  # pragma: no cover - compiled
     """Share of the light that arrives where each ray meets the road; 1 above the horizon. ``out``: float32 (H, W)."""
     for i in range(out.shape[0]):

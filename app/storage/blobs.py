@@ -41,7 +41,7 @@ class S3Parts:
         parts = urlsplit(url)
         self._bucket = parts.netloc if parts.scheme == "s3" else ""
         self._prefix = parts.path.strip("/")
-        self._made: Any = None
+        self._made: object = None
 
     def start(self, key: str) -> str:
         """Begin an upload of a blob; returns its id in S3.

@@ -319,5 +319,5 @@ def _length(vectors: Floats) -> Floats:
     return np.hypot(vectors[:, 0], vectors[:, 1])
 
 
-def _cosine(one: Floats, other: Floats) -> Any:
+def _cosine(one: Floats, other: Floats) -> object:
     return (one * other).sum(axis=1) / np.maximum(_length(one) * _length(other), 1e-9)

@@ -45,7 +45,7 @@ def write_geojson(track: Track, name: str, others: Sequence[dict[str, Any]] = ()
     others : sequence of dict
         Markers that gave no fix: features without a geometry.
     """
-    features: list[dict[str, Any]] = []
+    features: list[dict[str, object]] = []
     stamps = time_texts(track.time_s)
     for part in stretches(track):
         if len(part) < 2:
@@ -145,7 +145,7 @@ def _coordinates(lon_deg: Floats, lat_deg: Floats) -> list[list[float]]:
     return pairs
 
 
-def _fix_feature(result: FixResult) -> dict[str, Any]:
+def _fix_feature(result: FixResult) -> dict[str, object]:
     fix = result.fix
     return {
         "type": "Feature",

@@ -104,7 +104,7 @@ def sheet_document(sheet: DrillingSheet) -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": features, "waymark": _summary(sheet)}
 
 
-def _summary(sheet: DrillingSheet) -> dict[str, Any]:
+def _summary(sheet: DrillingSheet) -> dict[str, object]:
     layout, bill = sheet.layout, sheet.bill
     meaning = layout.meaning
     lon_deg, lat_deg, height_m = layout.lane.origin

@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import orjson
@@ -274,7 +274,7 @@ def write_bundle(
     options: BundleOptions | None = None,
     read: PlateReader | None = None,
     progress: Callable[[int], None] | None = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Write the artwork of a selection into one ZIP, proving every plate on the way.
 
     Parameters
@@ -361,7 +361,7 @@ def _add_all(packer: Packer, files: Sequence[tuple[str, bytes]]) -> None:
 
 def plate_files(
     order: PlateOrder, name: str, options: BundleOptions, read: PlateReader | None
-) -> tuple[list[tuple[str, bytes]], dict[str, Any]]:
+) -> tuple[list[tuple[str, bytes]], dict[str, object]]:
     """The files of a plate, by their names in the ZIP, and its entry in the manifest; raises as `write_bundle`."""
     drawing = encode_plate(order, options.artwork)
     proof = prove_plate(drawing, order.code, order.geometry, read) if read else None
@@ -387,7 +387,7 @@ def sheet_files(orders: Sequence[PlateOrder], options: BundleOptions) -> list[tu
     return files
 
 
-def _plate_entry(order: PlateOrder, files: list[str], proof: PlateProof | None) -> dict[str, Any]:
+def _plate_entry(order: PlateOrder, files: list[str], proof: PlateProof | None) -> dict[str, object]:
     code, geometry = order.code, order.geometry
     return {
         "plate_id": order.plate_id,
@@ -403,8 +403,8 @@ def _plate_entry(order: PlateOrder, files: list[str], proof: PlateProof | None) 
 
 
 def bundle_manifest(
-    plates: list[dict[str, Any]], files: list[dict[str, Any]], options: BundleOptions, *, proved: bool
-) -> dict[str, Any]:
+    plates: list[dict[str, object]], files: list[dict[str, object]], options: BundleOptions, *, proved: bool
+) -> dict[str, object]:
     """The manifest of a bundle, from the entries of its plates and files."""
     without_qr = sum(plate["record_url"] is None for plate in plates)
     return {

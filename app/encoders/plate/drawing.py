@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -253,7 +253,7 @@ class _Glyph:
 class _OutlinePen(BasePen):  # type: ignore[misc]
     """Collects a glyph's outline in the three forms that writers use."""
 
-    def __init__(self, glyphs: Any) -> None:
+    def __init__(self, glyphs: object) -> None:
         super().__init__(glyphs)
         self.svg: list[str] = []
         self.pdf: list[str] = []

@@ -60,7 +60,7 @@ class RoadFeature:
     where: str  # place in the file, for messages: ``feature 3``
     shape: Shape
     parts: tuple[Floats, ...]  # shape (N, 3): lines, points, or outer rings of areas; height is NaN where there is none
-    properties: Mapping[str, Any] = field(default_factory=dict)  # by lower-case name
+    properties: Mapping[str, object] = field(default_factory=dict)  # by lower-case name
     layer: str = ""  # name of its layer; decides the kind of a feature that states none
     curvature_per_m: Floats | None = None  # shape (N,), or None: [1/m] of a line with one part; left positive
 
@@ -162,7 +162,7 @@ def area_kind(kind: str) -> str:
     return _SINGULAR.get(kind, kind)
 
 
-def read_vertices(values: Any, where: str) -> Floats:
+def read_vertices(values: object, where: str) -> Floats:
     """Vertices as an array, shape (N, 3), with NaN as height where there is none.
 
     Parameters
@@ -203,7 +203,7 @@ def _array(values: Any) -> npt.NDArray[Any]:
         return np.asarray([[*vertex, math.nan][:3] if isinstance(vertex, list) else vertex for vertex in values])
 
 
-def read_ring(values: Any, where: str) -> Floats:
+def read_ring(values: object, where: str) -> Floats:
     """Closed ring of an area; raises InvalidParameter if it has fewer than three different vertices."""
     ring = read_vertices(values, where)
     if len(ring) and not np.array_equal(ring[0, :2], ring[-1, :2]):
@@ -398,7 +398,7 @@ def assemble_road(
     format_name: str,
     features: Sequence[RoadFeature],
     *,
-    defaults: Mapping[str, Any] | None = None,
+    defaults: Mapping[str, object] | None = None,
     crs: str | None = None,
     unit_m: float | None = None,
     warnings: Iterable[str] = (),
@@ -459,7 +459,7 @@ def _are_degrees(features: Sequence[RoadFeature]) -> bool:
     return bool(ends) and bool((np.abs(np.concatenate(ends)) <= (360.0, 90.0)).all())
 
 
-def _with_defaults(shared: Mapping[str, Any], feature: RoadFeature) -> dict[str, Any]:
+def _with_defaults(shared: Mapping[str, object], feature: RoadFeature) -> dict[str, object]:
     own = {name: value for name, value in feature.properties.items() if value is not None}
     speeds = any(name in own for name in ("speed_limit_kmh", "speed_limit_mph", "maxspeed"))
     usable = {k: v for k, v in shared.items() if k not in ("kind", "lane", "side", "name", "id", "crs")}

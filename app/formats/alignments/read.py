@@ -62,7 +62,7 @@ def read_geojson(data: bytes) -> AlignmentFile:
     return assemble_road("geojson", features, defaults=defaults, crs=_crs(document, found, defaults), unit_m=None)
 
 
-def _features(feature: Any, where: str) -> Iterator[RoadFeature]:
+def _features(feature: object, where: str) -> Iterator[RoadFeature]:
     if not isinstance(feature, dict):
         raise _unreadable(f"{where} is no object")
     properties = feature.get("properties")
@@ -97,7 +97,7 @@ def _geometries(geometry: Any, where: str, level: int = 0) -> Iterator[tuple[Sha
             raise _unreadable(f"{where} has a geometry of type {kind[:40]!r}")
 
 
-def _crs(document: dict[str, Any], features: list[Any], defaults: dict[str, Any]) -> str | None:
+def _crs(document: dict[str, object], features: list[object], defaults: dict[str, Any]) -> str | None:
     """The one CRS that the file states, as GeoJSON 2008 did and QGIS does, or as a property of the collection."""
     stated = {name for one in (document, *features) if (name := _old_crs(one)) is not None}
     if isinstance(defaults.get("crs"), str):
@@ -112,7 +112,7 @@ def _crs(document: dict[str, Any], features: list[Any], defaults: dict[str, Any]
     return stated.pop() if stated else None
 
 
-def _old_crs(one: Any) -> str | None:
+def _old_crs(one: object) -> str | None:
     crs = one.get("crs") if isinstance(one, dict) else None
     properties = crs.get("properties") if isinstance(crs, dict) else None
     name = properties.get("name") if isinstance(properties, dict) else None

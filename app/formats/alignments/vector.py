@@ -96,14 +96,14 @@ def _read_layer(data: bytes, layer: str | None) -> tuple[list[RoadFeature], str 
     return features, (name_crs(stated) or stated) if stated else None
 
 
-def _parts(shape: Any, kind: Shape | None, where: str) -> list[npt.NDArray[np.float64]]:
+def _parts(shape: object, kind: Shape | None, where: str) -> list[npt.NDArray[np.float64]]:
     ones = [one for one in shapely.get_parts(shape) if not shapely.is_empty(one)]
     if kind is Shape.AREA:
         return [read_ring(shapely.get_coordinates(one.exterior, include_z=True), where) for one in ones]
     return [read_vertices(shapely.get_coordinates(one, include_z=True), where) for one in ones]
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     return value.item() if isinstance(value, np.generic) else value
 
 

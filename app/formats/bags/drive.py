@@ -143,7 +143,7 @@ def _field(message: Any) -> list[float]:
     return [field.x, field.y, field.z]
 
 
-def _read(bag: Bag, topic: str, value: Callable[[Any], list[float]], max_rows: int) -> tuple[Floats, Floats]:
+def _read(bag: Bag, topic: str, value: Callable[[object], list[float]], max_rows: int) -> tuple[Floats, Floats]:
     """Times [s] and values of a topic, shape (N,) and (N, ...)."""
     times: list[float] = []
     values: list[list[float]] = []

@@ -30,7 +30,7 @@ from app.sensors.pose_track import ReceivedPacket
 # Every character is parsed at most three times whatever the file holds, so that no file takes longer than its length.
 
 
-Record = tuple[int, "dict[str, Any] | BrokenEntry"]
+Record = tuple[int, "dict[str, object] | BrokenEntry"]
 
 _LISTS = ("packets", "uplinks", "events", "records", "messages", "results")
 _MAX_DEPTH = 32  # levels of nesting; chosen by hand
@@ -68,7 +68,7 @@ def read_records(name: str, text: str, document_chars: int) -> Iterator[Record]:
     return _read_lines(text)
 
 
-def _from_document(document: Any) -> Iterator[Record]:
+def _from_document(document: object) -> Iterator[Record]:
     if isinstance(document, dict):
         within = next((document[n] for n in _LISTS if isinstance(document.get(n), list)), None)
         document = [document] if within is None else within
@@ -108,11 +108,11 @@ def _read_concatenated(text: str) -> Iterator[Record]:
         entry += 1
 
 
-class _Ambiguous(dict[str, Any]):
+class _Ambiguous(dict[str, object]):
     """An object that has a key twice."""
 
 
-def _parse(text: str) -> Any:
+def _parse(text: str) -> object:
     """A JSON value, or the reason why the text is none."""
     try:
         return _DECODER.decode(text)
@@ -120,7 +120,7 @@ def _parse(text: str) -> Any:
         return BrokenEntry("json", _why(error))
 
 
-def _checked(value: Any) -> dict[str, Any] | BrokenEntry:
+def _checked(value: object) -> dict[str, object] | BrokenEntry:
     """An object that is neither deep nor ambiguous, or the reason why it is left out."""
     if isinstance(value, BrokenEntry):
         return value
@@ -147,7 +147,7 @@ def _why(error: Exception) -> str:
     return f"not JSON: {str(error)[:120]}"
 
 
-def _object_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object_of(pairs: list[tuple[str, object]]) -> dict[str, object]:
     found = dict(pairs)
     return found if len(found) == len(pairs) else _Ambiguous(found)
 
@@ -178,7 +178,7 @@ class UplinkKind(StrEnum):
     THINGS_STACK = "things-stack-v3"
 
 
-def open_envelope(record: Mapping[str, Any]) -> tuple[Mapping[str, Any], str | None]:
+def open_envelope(record: Mapping[str, Any]) -> tuple[Mapping[str, object], str | None]:
     """The event inside the envelopes of brokers, dumps and storage, and the time of the outermost envelope.
 
     `{"topic": ..., "payload": {...} or its text}` of MQTT dumps, `{"result": {...}}` of The Things Stack's storage,
@@ -216,7 +216,7 @@ def _is_event(value: object) -> bool:
     return isinstance(value, dict) or (isinstance(value, str) and value.lstrip()[:1] == "{")
 
 
-def find_kind(record: Mapping[str, Any]) -> UplinkKind | None:
+def find_kind(record: Mapping[str, object]) -> UplinkKind | None:
     """The network server that a JSON object is from; None if it is no uplink event."""
     if "end_device_ids" in record:
         return UplinkKind.THINGS_STACK
@@ -231,7 +231,7 @@ def find_kind(record: Mapping[str, Any]) -> UplinkKind | None:
     return None
 
 
-def packet_from_uplink(entry: int, kind: UplinkKind, record: Mapping[str, Any], clock: LogClock) -> ReceivedPacket:
+def packet_from_uplink(entry: int, kind: UplinkKind, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
     """One packet of an uplink event.
 
     Raises
@@ -247,7 +247,7 @@ def packet_from_uplink(entry: int, kind: UplinkKind, record: Mapping[str, Any], 
 # --- ChirpStack v4 ------------------------------------------------------------------------------------------------
 
 
-def _from_chirpstack(entry: int, record: Mapping[str, Any], clock: LogClock) -> ReceivedPacket:
+def _from_chirpstack(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
     if "devEUI" in record and "deviceInfo" not in record:
         raise BrokenEntry("old-version", "an event of ChirpStack v3 or older; v4 is read")
     receptions = _objects(record.get("rxInfo"))
@@ -285,7 +285,7 @@ def _gps_time(value: object, clock: LogClock) -> float:
 # --- The Things Stack v3 ------------------------------------------------------------------------------------------
 
 
-def _from_things_stack(entry: int, record: Mapping[str, Any], clock: LogClock) -> ReceivedPacket:
+def _from_things_stack(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
     uplink = record.get("uplink_message")
     if not isinstance(uplink, dict):
         other = next((name for name in _OTHER_EVENTS if name in record), "of no known kind")
@@ -321,11 +321,11 @@ def _from_things_stack(entry: int, record: Mapping[str, Any], clock: LogClock) -
 # --- both ---------------------------------------------------------------------------------------------------------
 
 
-def _objects(value: object) -> list[dict[str, Any]]:
+def _objects(value: object) -> list[dict[str, object]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def _best(receptions: list[dict[str, Any]]) -> dict[str, Any]:
+def _best(receptions: list[dict[str, object]]) -> dict[str, object]:
     """The reception of the strongest gateway; an RSSI of zero, which is left out, was not measured."""
     return max(receptions, key=lambda reception: _signal(reception.get("rssi"), -math.inf), default={})
 
@@ -373,7 +373,9 @@ def read_json(source: PacketSource) -> Iterator[ReceivedPacket]:
             report.leave_out(entry, broken.kind, broken.reason)
 
 
-def _packet_from_record(entry: int, record: Mapping[str, Any], source: PacketSource, shapes: _Shapes) -> ReceivedPacket:
+def _packet_from_record(
+    entry: int, record: Mapping[str, object], source: PacketSource, shapes: _Shapes
+) -> ReceivedPacket:
     declaration = source.declaration
     event, outer_time = open_envelope(record)
     kind = find_kind(event)

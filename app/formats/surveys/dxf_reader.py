@@ -48,7 +48,7 @@ def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceT
     with reading_dxf():
         document, found = open_dxf(data)
         entities = list(document.modelspace().query("POINT INSERT"))
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
     for entity in entities:
@@ -123,8 +123,8 @@ def open_dxf(data: bytes) -> tuple[Any, tuple[str, float] | None]:
     return document, _UNITS[code]
 
 
-def _values(entity: Any) -> dict[str, Any]:
-    values: dict[str, Any] = {"layer": entity.dxf.layer}
+def _values(entity: Any) -> dict[str, object]:
+    values: dict[str, object] = {"layer": entity.dxf.layer}
     if entity.dxftype() == "INSERT":
         values["block"] = entity.dxf.name
         values |= {str(attribute.dxf.tag).lower(): attribute.dxf.text for attribute in entity.attribs}

@@ -162,8 +162,8 @@ def _inflated(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 def _read(kind: str, data: bytes, layer: str | None) -> SourceTable:
     from pyogrio import raw, read_info  # type: ignore[import-untyped]
 
-    points: list[Any] = []
-    columns: list[list[Any]] = []
+    points: list[object] = []
+    columns: list[list[object]] = []
     faults = Faults()
     try:
         with warnings.catch_warnings():

@@ -91,7 +91,7 @@ def read_geojson(data: bytes) -> SourceTable:
     )
 
 
-def _coordinates(feature: Any) -> list[float] | None:
+def _coordinates(feature: object) -> list[float] | None:
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     if not isinstance(geometry, dict) or geometry.get("type") != "Point":
         return None
@@ -103,7 +103,7 @@ def _coordinates(feature: Any) -> list[float] | None:
     return found
 
 
-def _single_points(feature: Any) -> Iterable[Any]:
+def _single_points(feature: Any) -> Iterable[object]:
     """One feature for each point of a multipoint, with the properties of all."""
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     if not isinstance(geometry, dict) or geometry.get("type") != "MultiPoint":
@@ -114,16 +114,16 @@ def _single_points(feature: Any) -> Iterable[Any]:
     return ({**feature, "geometry": {"type": "Point", "coordinates": place}} for place in places)
 
 
-def _properties(feature: Any) -> dict[str, Any]:
+def _properties(feature: object) -> dict[str, object]:
     found = feature.get("properties") if isinstance(feature, dict) else None
     return found if isinstance(found, dict) else {}
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     return value if value is None or isinstance(value, str | int | float) else str(value)[:200]
 
 
-def _old_crs(document: dict[str, Any]) -> str | None:
+def _old_crs(document: dict[str, object]) -> str | None:
     """The CRS of GeoJSON 2008, which QGIS and others still write."""
     crs = document.get("crs")
     properties = crs.get("properties") if isinstance(crs, dict) else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -171,7 +171,7 @@ def _named(source: SourceTable, role: str, declaration: ImportDeclaration) -> It
         yield from (k for k, other in enumerate(names) if other == name)
 
 
-def _evidence(cells: Sequence[Any], role: str, code_form: CodeForm | None) -> tuple[str, bool]:
+def _evidence(cells: Sequence[object], role: str, code_form: CodeForm | None) -> tuple[str, bool]:
     """What the values show about a role, and whether they fit it."""
     fits: Callable[[str], object]
     if role == "code" and code_form is not None:
@@ -193,14 +193,14 @@ def _evidence(cells: Sequence[Any], role: str, code_form: CodeForm | None) -> tu
     return f"{good} of {len(values)} values are {form}", True
 
 
-def _sample(cells: Sequence[Any]) -> Iterator[str]:
+def _sample(cells: Sequence[object]) -> Iterator[str]:
     """Texts of values throughout a column, without empty ones."""
     for k in range(0, len(cells), max(len(cells) // _SAMPLE, 1)):
         if text := cell_text(cells[k]):
             yield text
 
 
-def cell_text(value: Any) -> str:
+def cell_text(value: object) -> str:
     """A value as text; whole numbers without decimals, empty where there is none."""
     if value is None or (isinstance(value, float) and value != value):
         return ""

@@ -383,7 +383,7 @@ def _in_range(found: re.Match[str]) -> bool:
     return all(float((found[k] or "0").replace(",", ".")) < 60 for k in (3, 4))
 
 
-def _parts(cells: Sequence[Any]) -> Iterator[Sequence[Any]]:
+def _parts(cells: Sequence[object]) -> Iterator[Sequence[object]]:
     if isinstance(cells, Texts):
         return cells.parts()
     return (cells[start : start + _PART_CELLS] for start in range(0, len(cells), _PART_CELLS))
@@ -400,7 +400,7 @@ def _read_fast(cells: Sequence[Any]) -> Floats | None:
     return values if np.isfinite(values).all() else None
 
 
-def _read_one(cell: Any, field: str, row: int, form: NumberForm, required: bool) -> float | Fault:
+def _read_one(cell: object, field: str, row: int, form: NumberForm, required: bool) -> float | Fault:
     if cell is None or (isinstance(cell, str) and not cell.strip()) or (isinstance(cell, float) and np.isnan(cell)):
         if required:
             return Fault(row, field, "missing", f"{field} is empty", "fill it in, or leave the row out")

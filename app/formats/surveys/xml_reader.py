@@ -7,7 +7,6 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -34,7 +33,7 @@ def read_kml(data: bytes) -> SourceTable:
     UnreadableUpload
         It is no XML, has a document type, or too many elements.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
     for placemark in elements(data, "Placemark"):
@@ -75,7 +74,7 @@ def read_gpx(data: bytes) -> SourceTable:
     UnreadableUpload
         It is no XML, has a document type, or too many elements.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
     tracked = 0
@@ -111,7 +110,7 @@ def read_landxml(data: bytes) -> SourceTable:
     UnreadableUpload
         It is no XML, has a document type, names units that are not known, or too many elements.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
     crs = unit = None
@@ -181,8 +180,8 @@ def _below(element: ET.Element, name: str) -> Iterator[ET.Element]:
     return (child for child in element.iter() if local_name(child.tag) == name)
 
 
-def _kml_values(placemark: ET.Element) -> dict[str, Any]:
-    values: dict[str, Any] = {}
+def _kml_values(placemark: ET.Element) -> dict[str, object]:
+    values: dict[str, object] = {}
     for child in placemark.iter():
         kind = local_name(child.tag)
         if kind in ("name", "description") and kind not in values:
@@ -205,7 +204,7 @@ def _numbers(parts: list[str]) -> list[float] | None:
 
 def _table(
     kind: str,
-    rows: list[dict[str, Any]],
+    rows: list[dict[str, object]],
     points: list[tuple[float, float, float]],
     faults: list[Fault],
     *,

@@ -193,7 +193,7 @@ def _from_dbc(
     return placed, partial(_decode_signal, message, entry)
 
 
-def _load_signals(dbc: Sequence[Part], name: str, field: str) -> dict[str, tuple[Any, Any]]:
+def _load_signals(dbc: Sequence[Part], name: str, field: str) -> dict[str, tuple[object, object]]:
     """Messages and signals of all DBCs, by `Message.Signal`."""
     try:
         import cantools
@@ -211,7 +211,7 @@ def _load_signals(dbc: Sequence[Part], name: str, field: str) -> dict[str, tuple
             limit="a .dbc file, or identifier and bits",
             cure="send the DBC with the log, or declare identifier, bits and scaling",
         )
-    found: dict[str, tuple[Any, Any]] = {}
+    found: dict[str, tuple[object, object]] = {}
     for part in dbc:
         try:
             database = cantools.database.load_string(_text(part), "dbc", strict=False)
@@ -224,7 +224,7 @@ def _load_signals(dbc: Sequence[Part], name: str, field: str) -> dict[str, tuple
     return found
 
 
-def _find_signal(name: str, found: dict[str, tuple[Any, Any]], field: str) -> tuple[Any, Any]:
+def _find_signal(name: str, found: dict[str, tuple[object, object]], field: str) -> tuple[Any, Any]:
     """The message and the signal that a name, with or without its message, stands for."""
     matching = [k for k in found if k == name or k.split(".", 1)[1] == name]
     if len(matching) > 1:

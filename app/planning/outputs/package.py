@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from functools import cache, cached_property, partial
-from typing import Any
 
 import orjson
 
@@ -259,7 +258,7 @@ class Package:
             case PartKind.QUALITY:
                 return self._quality(part)
 
-    def manifest(self, entries: list[dict[str, Any]]) -> bytes:
+    def manifest(self, entries: list[dict[str, object]]) -> bytes:
         """The manifest: what was packed, with the name, size and SHA-256 of each file."""
         document = {
             "format": PACKAGE_FORMAT,

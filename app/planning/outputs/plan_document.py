@@ -168,7 +168,7 @@ class PlanDocument(_Part):
     markers: tuple[PlannedMarker, ...]
     left_out: tuple[LeftOut, ...]
     findings: tuple[PlanFinding, ...]
-    codebook: dict[str, Any] | None
+    codebook: dict[str, object] | None
     radio: RadioSettings | None
     optimum: Optimum | None = None
 
@@ -268,7 +268,7 @@ def marker_feature(plan: Plan, marker: PlannedMarker) -> dict[str, Any]:
     return {**_feature(_point(marker.lon_deg, marker.lat_deg, height), properties), "id": marker.number}
 
 
-def _details(detail: Detail) -> dict[str, Any]:
+def _details(detail: Detail) -> dict[str, object]:
     match detail:
         case PlannedPlate():
             return {"scheme": detail.code.scheme.value, "side_mm": detail.geometry.side_mm}
@@ -285,16 +285,16 @@ def _side(side: LaneSide) -> str:
     return side.name.lower()
 
 
-def _feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:
+def _feature(geometry: dict[str, object], properties: dict[str, object]) -> dict[str, object]:
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def _point(lon_deg: float, lat_deg: float, height_m: float | None = None) -> dict[str, Any]:
+def _point(lon_deg: float, lat_deg: float, height_m: float | None = None) -> dict[str, object]:
     place = [round(lon_deg, _DECIMALS), round(lat_deg, _DECIMALS)]
     return {"type": "Point", "coordinates": place if height_m is None else [*place, round(height_m, 4)]}
 
 
-def _line(lane: Lane) -> dict[str, Any]:
+def _line(lane: Lane) -> dict[str, object]:
     return {"type": "LineString", "coordinates": lane_points_deg(lane)}
 
 
@@ -354,7 +354,7 @@ def write_plan_programs_csv(programs: Sequence[MarkerProgram]) -> bytes:
 
 def write_plan_programs_json(plan: Plan, programs: Sequence[MarkerProgram]) -> bytes:
     """The programming list as JSON, without keys: the radio's settings once, and number and message of each marker."""
-    document: dict[str, Any] = {
+    document: dict[str, object] = {
         "format": PROGRAMS_FORMAT,
         "plan": plan.name,
         "keys": "not included: the server derives each marker's key when the plan is committed",

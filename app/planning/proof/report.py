@@ -9,7 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, TypedDict
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -463,7 +463,7 @@ NOTE = (
 """What the figures are, in every document."""
 
 
-def report_document(report: ProofReport) -> dict[str, Any]:
+def report_document(report: ProofReport) -> dict[str, object]:
     """The report as JSON values."""
     return {
         "format": PROOF_FORMAT,
