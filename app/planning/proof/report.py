@@ -7,7 +7,7 @@ import math
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Annotated, TypedDict
 
@@ -464,18 +464,18 @@ NOTE = (
 
 
 def report_document(report: ProofReport) -> dict[str, object]:
-    """The report as JSON values."""
+    """The report as it is written."""
     return {
         "format": PROOF_FORMAT,
         "plan": report.plan,
         "terms": report.terms.model_dump(mode="json"),
         "complete": report.complete,
         "note": NOTE,
-        "rates": [asdict(rate) for rate in report.rates],
-        "drives": [asdict(drive) for drive in report.drives],
+        "rates": report.rates,
+        "drives": report.drives,
         "weak": [marker.number for marker in report.weak],
         "wrong": [{"drive": drive, "marker": marker, "text": text} for drive, marker, text in report.wrong],
-        "markers": [asdict(marker) for marker in report.markers],
+        "markers": report.markers,
     }
 
 

@@ -9,6 +9,8 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from app.families.cerpm import RadioDocument
+from app.planning.plan import LeftOut
+from app.planning.proof.report import DriveResult, MarkerProof, ReadRate
 from app.planning.radio_checks import RadioCheck, RadioPlan, Recommendation, check_radio, recommend_settings
 from app.radio.reception import RoadReception
 from app.services.documents import document_of
@@ -125,19 +127,6 @@ class ProofTermsDocument(TypedDict):
     weak_below: float
 
 
-class ReadRateDocument(TypedDict):
-    """Share of passes in which markers of one kind were read, with its 95 % interval."""
-
-    kind: str
-    condition: str
-    passes: int
-    read: int
-    lost: int
-    rate: float
-    low: float
-    high: float
-
-
 class WeakMarker(TypedDict):
     """A marker that is read too rarely, and the most frequent cause."""
 
@@ -158,7 +147,7 @@ class ProofFigures(TypedDict):
     passed: bool
     """No reading was wrong. Weak markers do not count."""
     units: int
-    rates: list[ReadRateDocument]
+    rates: list[ReadRate]
     markers: int
     """Markers that were driven over."""
     weak: int
@@ -174,52 +163,6 @@ class ProofSummary(ProofFigures):
     job_id: str
     at: datetime
     """When it ended."""
-
-
-class MarkerProofDocument(TypedDict):
-    """What the drives show about one marker."""
-
-    number: int
-    code: str
-    kind: str
-    lane: str
-    chainage_m: float
-    station_m: float
-    lon_deg: float
-    lat_deg: float
-    passes: int
-    read: int
-    lost: int
-    wrong: int
-    rate: float | None
-    low: float | None
-    high: float | None
-    fix_rms_m: float | None
-    weak: bool
-    cause: str | None
-
-
-class DriveDocument(TypedDict):
-    """One drive on one lane."""
-
-    drive: int
-    lane: str
-    condition: str
-    camera: str
-    passes: int
-    read: int
-    fixes: int
-    wrong: int
-    fix_rms_m: float | None
-    fix_worst_m: float | None
-    longest_gap_m: float | None
-    gap_from_m: float | None
-    gap_estimated: bool
-    path_rms_m: float | None
-    path_worst_m: float | None
-    path_worst_at_m: float | None
-    path_coverage: float | None
-    refusals: list[str]
 
 
 class WrongReadingDocument(TypedDict):
@@ -239,11 +182,11 @@ class ProofDocument(TypedDict):
     terms: ProofTermsDocument
     complete: bool
     note: str
-    rates: list[ReadRateDocument]
-    drives: list[DriveDocument]
+    rates: list[ReadRate]
+    drives: list[DriveResult]
     weak: list[int]
     wrong: list[WrongReadingDocument]
-    markers: list[MarkerProofDocument]
+    markers: list[MarkerProof]
 
 
 # === Documents of alignments and plans, as clients see them.
@@ -373,16 +316,6 @@ class FindingDocument(TypedDict):
     lat_deg: float | None
 
 
-class LeftOutDocument(TypedDict):
-    """A place that the rules ask for and that got no marker, or a moved one."""
-
-    family: str
-    lane: str
-    chainage_m: float
-    reason: str
-    moved_m: float | None
-
-
 class PlanSummary(TypedDict):
     """What was placed, and what the checks found."""
 
@@ -391,7 +324,7 @@ class PlanSummary(TypedDict):
     verdict: str
     """The worst of all findings."""
     findings: list[FindingDocument]
-    left_out: list[LeftOutDocument]
+    left_out: list[LeftOut]
     left_out_count: int
     cost: float
     cost_complete: bool

@@ -3303,7 +3303,7 @@ export interface components {
             findings: components["schemas"]["FindingDocument"][];
             id: string;
             lane_length_m: number;
-            left_out: components["schemas"]["LeftOutDocument"][];
+            left_out: components["schemas"]["LeftOut"][];
             left_out_count: number;
             markers: number;
             name: string;
@@ -3701,26 +3701,6 @@ export interface components {
             /** @default 0 */
             offset_s?: number;
         };
-        DriveDocument: {
-            camera: string;
-            condition: string;
-            drive: number;
-            fix_rms_m: number | null;
-            fix_worst_m: number | null;
-            fixes: number;
-            gap_estimated: boolean;
-            gap_from_m: number | null;
-            lane: string;
-            longest_gap_m: number | null;
-            passes: number;
-            path_coverage: number | null;
-            path_rms_m: number | null;
-            path_worst_at_m: number | null;
-            path_worst_m: number | null;
-            read: number;
-            refusals: string[];
-            wrong: number;
-        };
         DriveGap: {
             from_time: string;
             length_m: number;
@@ -3811,6 +3791,27 @@ export interface components {
             statistics: components["schemas"]["DriveStatistics"];
             summary: string;
             warnings: string[];
+        };
+        DriveResult: {
+            camera: string;
+            condition: string;
+            drive: number;
+            fix_rms_m: number | null;
+            fix_worst_m: number | null;
+            fixes: number;
+            gap_estimated: boolean;
+            gap_from_m: number | null;
+            lane: string;
+            longest_gap_m: number | null;
+            passes: number;
+            path_coverage: number | null;
+            path_rms_m: number | null;
+            path_worst_at_m: number | null;
+            path_worst_m: number | null;
+            read: number;
+            /** @default [] */
+            refusals?: string[];
+            wrong: number;
         };
         DriveStatistics: {
             duration_s: number;
@@ -4526,11 +4527,12 @@ export interface components {
             road: string;
             width_m: number[];
         };
-        LeftOutDocument: {
+        LeftOut: {
             chainage_m: number;
             family: string;
             lane: string;
-            moved_m: number | null;
+            /** @default null */
+            moved_m?: number | null;
             reason: string;
         };
         LeftOutEntryDocument: {
@@ -4755,7 +4757,7 @@ export interface components {
              */
             status?: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
         };
-        MarkerProofDocument: {
+        MarkerProof: {
             cause: string | null;
             chainage_m: number;
             code: string;
@@ -5148,7 +5150,7 @@ export interface components {
             findings: components["schemas"]["FindingDocument"][];
             id: string;
             lane_length_m: number;
-            left_out: components["schemas"]["LeftOutDocument"][];
+            left_out: components["schemas"]["LeftOut"][];
             left_out_count: number;
             name: string;
             proof: components["schemas"]["ProofSummary"] | null;
@@ -5265,7 +5267,7 @@ export interface components {
             currency: string;
             findings: components["schemas"]["FindingDocument"][];
             lane_length_m: number;
-            left_out: components["schemas"]["LeftOutDocument"][];
+            left_out: components["schemas"]["LeftOut"][];
             left_out_count: number;
             markers: components["schemas"]["PreviewedMarker"][];
             verdict: string;
@@ -5655,12 +5657,12 @@ export interface components {
         };
         ProofDocument: {
             complete: boolean;
-            drives: components["schemas"]["DriveDocument"][];
+            drives: components["schemas"]["DriveResult"][];
             format: string;
-            markers: components["schemas"]["MarkerProofDocument"][];
+            markers: components["schemas"]["MarkerProof"][];
             note: string;
             plan: string;
-            rates: components["schemas"]["ReadRateDocument"][];
+            rates: components["schemas"]["ReadRate"][];
             terms: components["schemas"]["ProofTermsDocument"];
             weak: number[];
             wrong: components["schemas"]["WrongReadingDocument"][];
@@ -5698,7 +5700,7 @@ export interface components {
             job_id: string;
             markers: number;
             passed: boolean;
-            rates: components["schemas"]["ReadRateDocument"][];
+            rates: components["schemas"]["ReadRate"][];
             terms: components["schemas"]["ProofTermsDocument"];
             units: number;
             weak: number;
@@ -5852,7 +5854,7 @@ export interface components {
             /** @enum {string} */
             status: "ready" | "not ready";
         };
-        ReadRateDocument: {
+        ReadRate: {
             condition: string;
             high: number;
             kind: string;
