@@ -224,104 +224,6 @@ def _what(match: Match) -> str:
     return "ambiguous" if match.ambiguous else "seen"
 
 
-# === Frames of an archive on their way through the decoder processes, several in one task.
-#
-# Handing over a task costs the server the same for one frame as for eight. With runs it takes 2.8 ms of processor time
-# a frame, without 4.4 (two runs of `benchmarks.service.throughput` each on a busy machine, 800 frames of 1080p).
-
-
-RUN_FRAMES = 8
-"""Frames of a run at most. Source: by hand."""
-RUN_PIXELS = 20_000_000
-"""Pixels of a run at most, unless one frame has more. [px] Source: by hand; less than the largest frame, which must
-be decoded within the same time."""
-RUN_BYTES = 8 * 1024**2
-"""Bytes of a run at most, unless one frame has more. [byte] Source: by hand."""
-
-
-@dataclass(frozen=True, slots=True)
-class ArchiveFrame:
-    """A frame that was inspected."""
-
-    index: int  # number of its file in the archive
-    name: str
-    moment: FrameMoment
-    picture: FramePicture | None = None  # None where an error keeps it from the decoder processes
-    search: FrameSearch = field(default_factory=dict)
-    nearby: NearbyMarkers = field(default_factory=NearbyMarkers)
-    pixels: int = 0  # [px]
-    error: WaymarkError | None = None
-
-
-def in_runs(frames: Iterable[ArchiveFrame]) -> Iterator[list[ArchiveFrame]]:
-    """Frames in their order, as many together as a run may have."""
-    run: list[ArchiveFrame] = []
-    pixels = size = 0
-    for frame in frames:
-        frame_bytes = frame.picture.file.size if frame.picture is not None else 0
-        pixels, size = pixels + frame.pixels, size + frame_bytes
-        if run and (len(run) == RUN_FRAMES or pixels > RUN_PIXELS or size > RUN_BYTES):
-            yield run
-            run, pixels, size = [], frame.pixels, frame_bytes
-        run.append(frame)
-    if run:
-        yield run
-
-
-class PendingRun:
-    """Frames in a decoder process.
-
-    Parameters
-    ----------
-    processes : DecoderProcesses
-    frames : list of ArchiveFrame
-    wait_s : float
-        How long to wait for a place. [s]
-
-    Raises
-    ------
-    Unavailable
-        The decoder processes are busy.
-    """
-
-    def __init__(self, processes: DecoderProcesses, frames: list[ArchiveFrame], wait_s: float) -> None:
-        self._processes, self._frames, self._wait_s = processes, frames, wait_s
-        self._pending = self._submit(frames)
-
-    def results(self, report: Callable[[], None]) -> list[tuple[ArchiveFrame, FrameResult | WaymarkError]]:
-        """Each frame with what was found in it, or the error.
-
-        Where a frame stops the process of the run, each is decoded alone: only that frame has the error. `report` is
-        called before each of these; what it raises ends the run.
-        """
-        try:
-            found = iter(self._pending.result() if self._pending is not None else ())
-        except ProcessStopped as error:
-            decodable = [frame for frame in self._frames if frame.picture is not None]
-            found = iter([error] if len(decodable) == 1 else [self._alone(frame, report) for frame in decodable])
-        return [(frame, frame.error if frame.error is not None else next(found)) for frame in self._frames]
-
-    def cancel(self) -> None:
-        """Stop the process."""
-        if self._pending is not None:
-            self._pending.cancel()
-
-    def _submit(self, frames: list[ArchiveFrame]) -> Pending[tuple[FrameResult | WaymarkError, ...]] | None:
-        run = tuple((frame.picture, frame.search) for frame in frames if frame.picture is not None)
-        return self._processes.submit(decode_frames, run, wait_s=self._wait_s) if run else None
-
-    def _alone(self, frame: ArchiveFrame, report: Callable[[], None]) -> FrameResult | WaymarkError:
-        report()
-        try:
-            self._pending = self._submit([frame])
-            assert self._pending is not None
-            return self._pending.result()[0]
-        except Unavailable:
-            raise
-        except WaymarkError as error:
-            return error
-
-
 # === ZIP archives of frames: always jobs, with progress, and with one entry for each frame that cannot be read.
 
 
@@ -418,19 +320,6 @@ class PendingArchive:
         notes = DriveNotes((*self._places.warnings, *warnings), gaps, receiver=self._places.receiver)
         return ArchiveSignal(self._frames, len(self._codebook), notes)
 
-    def _report(self, total: int) -> None:
-        """Record now and then how far the job is; what this raises stops it."""
-        now, done = self._clock(), len(self._frames)
-        if now - self._reported_at < self._rules.progress_every:
-            return
-        self._reported_at = now
-        part = None
-        if now - self._part_at >= PART_EVERY:
-            self._part_at = now
-            notes = DriveNotes(self._places.warnings)
-            part = frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes)
-        self._upload.report(done, total, part)
-
     def cancel(self) -> None:
         """Stop the frames that are on their way."""
         for waiting in self._waiting:
@@ -500,6 +389,19 @@ class PendingArchive:
         }
         self._report(total)
 
+    def _report(self, total: int) -> None:
+        """Record now and then how far the job is; what this raises stops it."""
+        now, done = self._clock(), len(self._frames)
+        if now - self._reported_at < self._rules.progress_every:
+            return
+        self._reported_at = now
+        part = None
+        if now - self._part_at >= PART_EVERY:
+            self._part_at = now
+            notes = DriveNotes(self._places.warnings)
+            part = frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes)
+        self._upload.report(done, total, part)
+
     def _confirm(self) -> None:
         """Match plates again that are tentative in single frames, and that several frames confirm together."""
         places = {frame.index: place for place, frame in enumerate(self._frames)}
@@ -522,3 +424,101 @@ class PendingArchive:
 
 def _plates(result: FrameResult) -> list[PlateReading]:
     return [reading for reading in result.readings if isinstance(reading, PlateReading)]
+
+
+# === Frames of an archive on their way through the decoder processes, several in one task.
+#
+# Handing over a task costs the server the same for one frame as for eight. With runs it takes 2.8 ms of processor time
+# a frame, without 4.4 (two runs of `benchmarks.service.throughput` each on a busy machine, 800 frames of 1080p).
+
+
+RUN_FRAMES = 8
+"""Frames of a run at most. Source: by hand."""
+RUN_PIXELS = 20_000_000
+"""Pixels of a run at most, unless one frame has more. [px] Source: by hand; less than the largest frame, which must
+be decoded within the same time."""
+RUN_BYTES = 8 * 1024**2
+"""Bytes of a run at most, unless one frame has more. [byte] Source: by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArchiveFrame:
+    """A frame that was inspected."""
+
+    index: int  # number of its file in the archive
+    name: str
+    moment: FrameMoment
+    picture: FramePicture | None = None  # None where an error keeps it from the decoder processes
+    search: FrameSearch = field(default_factory=dict)
+    nearby: NearbyMarkers = field(default_factory=NearbyMarkers)
+    pixels: int = 0
+    error: WaymarkError | None = None
+
+
+def in_runs(frames: Iterable[ArchiveFrame]) -> Iterator[list[ArchiveFrame]]:
+    """Frames in their order, as many together as a run may have."""
+    run: list[ArchiveFrame] = []
+    pixels = size = 0
+    for frame in frames:
+        frame_bytes = frame.picture.file.size if frame.picture is not None else 0
+        pixels, size = pixels + frame.pixels, size + frame_bytes
+        if run and (len(run) == RUN_FRAMES or pixels > RUN_PIXELS or size > RUN_BYTES):
+            yield run
+            run, pixels, size = [], frame.pixels, frame_bytes
+        run.append(frame)
+    if run:
+        yield run
+
+
+class PendingRun:
+    """Frames in a decoder process.
+
+    Parameters
+    ----------
+    processes : DecoderProcesses
+    frames : list of ArchiveFrame
+    wait_s : float
+        How long to wait for a place. [s]
+
+    Raises
+    ------
+    Unavailable
+        The decoder processes are busy.
+    """
+
+    def __init__(self, processes: DecoderProcesses, frames: list[ArchiveFrame], wait_s: float) -> None:
+        self._processes, self._frames, self._wait_s = processes, frames, wait_s
+        self._pending = self._submit(frames)
+
+    def results(self, report: Callable[[], None]) -> list[tuple[ArchiveFrame, FrameResult | WaymarkError]]:
+        """Each frame with what was found in it, or the error.
+
+        Where a frame stops the process of the run, each is decoded alone: only that frame has the error. `report` is
+        called before each of these; what it raises ends the run.
+        """
+        try:
+            found = iter(self._pending.result() if self._pending is not None else ())
+        except ProcessStopped as error:
+            decodable = [frame for frame in self._frames if frame.picture is not None]
+            found = iter([error] if len(decodable) == 1 else [self._alone(frame, report) for frame in decodable])
+        return [(frame, frame.error if frame.error is not None else next(found)) for frame in self._frames]
+
+    def cancel(self) -> None:
+        """Stop the process."""
+        if self._pending is not None:
+            self._pending.cancel()
+
+    def _submit(self, frames: list[ArchiveFrame]) -> Pending[tuple[FrameResult | WaymarkError, ...]] | None:
+        run = tuple((frame.picture, frame.search) for frame in frames if frame.picture is not None)
+        return self._processes.submit(decode_frames, run, wait_s=self._wait_s) if run else None
+
+    def _alone(self, frame: ArchiveFrame, report: Callable[[], None]) -> FrameResult | WaymarkError:
+        report()
+        try:
+            self._pending = self._submit([frame])
+            assert self._pending is not None
+            return self._pending.result()[0]
+        except Unavailable:
+            raise
+        except WaymarkError as error:
+            return error
