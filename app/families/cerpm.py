@@ -28,13 +28,12 @@ from app.families.documents import (
     place_input,
     position_columns,
 )
-from app.families.family import Family, Registration, SnapshotRecord, map_point
+from app.families.family import Family, Registration, map_point
 from app.families.surveys import (
     Commitment,
     Flags,
     MarkerRules,
     NewMarker,
-    PlannedMarkers,
     PlannedRow,
     RowCodes,
     Rows,
@@ -298,75 +297,6 @@ def cerpm_document(row: MarkerRow) -> CerpmDocument:
     }
 
 
-# === Planned CERPMs as rows of the registry.
-
-
-class PlannedCerpms(PlannedMarkers):
-    """Number, side, speed limit and radio."""
-
-    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
-        """A number names one CERPM of its agency."""
-        return {int(row.digits) for row in known if row.agency_id == agency_id}
-
-    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
-        """One row for each CERPM."""
-        radio = asdict(commitment.radio)
-        for marker in markers:
-            detail = marker.detail
-            assert isinstance(detail, PlannedCerpm)
-            spec = {
-                "side": detail.side.name.lower(),
-                "speed_limit": speed_limit_document(detail.speed_limit),
-                "dev_eui": None,
-                "radio": radio,
-            }
-            columns = {
-                **commitment.position(marker),
-                "scheme": "cerpm",
-                "digits": str(detail.number),
-                "spec": spec,
-            }
-            yield PlannedRow(marker.number, columns)
-
-
-# === CERPMs in the snapshot of an area.
-
-
-_HEARD = ("first_sequence", "last_sequence", "first_heard_s", "last_heard_s")
-
-
-class CerpmSnapshot(SnapshotRecord):
-    """Side, speed limit and interval of CERPMs, and which transmissions were received.
-
-    Retired ones are included: whoever has their keys can still send.
-    """
-
-    with_retired = True
-
-    def columns(self) -> tuple[sa.ColumnElement[Any], ...]:
-        """Side, speed limit and interval."""
-        spec = markers.c.spec
-        radio = spec["radio"]
-        return (
-            spec["side"].as_string().label("side"),
-            spec["speed_limit"].label("speed_limit"),
-            radio["interval_s"].as_float().label("interval_s"),
-            radio["jitter_share"].as_float().label("jitter_share"),
-        )
-
-    def kind(self, row: MarkerRow) -> dict[str, Any]:
-        """Side, speed limit and the shortest interval between two transmissions."""
-        spec = row.spec
-        min_interval_s = spec["interval_s"] * (1 - spec["jitter_share"])
-        return {"side": spec["side"], "speed_limit": spec["speed_limit"], "min_interval_s": min_interval_s}
-
-    def members(self, connection: sa.Connection, agency_id: str, codes: Sequence[str]) -> Mapping[str, Sequence[Any]]:
-        """First and last transmission that was received from each."""
-        received = cerpms.list_span_ends(connection, agency_id, map(int, codes))
-        ends = [received.get(int(code)) for code in codes]
-        return {name: [None if end is None else getattr(end, name) for end in ends] for name in _HEARD}
-
-
 # === Surveys of CERPMs.
 
 
@@ -501,6 +431,9 @@ def _default_radio() -> dict[str, Any]:
 # === The family of CERPMs: their numbers, the properties that they broadcast, and their radio.
 
 
+_SPAN = ("first_sequence", "last_sequence", "first_heard_s", "last_heard_s")
+
+
 class Cerpms(Family[NewCerpm, PlacedPosition]):
     """The family of chip-enabled raised pavement markers."""
 
@@ -510,9 +443,8 @@ class Cerpms(Family[NewCerpm, PlacedPosition]):
     schema = CerpmIn
     examples = CERPM_EXAMPLES
     change = CerpmChange
-    snapshot = CerpmSnapshot()
+    in_snapshots_when_retired = True  # whoever has the keys of a retired one can still send
     survey = CerpmSurvey()
-    planned = PlannedCerpms()
     lines = CerpmRuns()
     document_type = CerpmDocument
     detail_type = CerpmDocument
@@ -588,6 +520,55 @@ class Cerpms(Family[NewCerpm, PlacedPosition]):
         """A point, with the side of the lane that it is on."""
         side = row.spec["side"]
         return (map_point(row, kind="" if side == "unknown" else side),)
+
+    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
+        """A number names one CERPM of its agency."""
+        return {int(row.digits) for row in known if row.agency_id == agency_id}
+
+    def planned_rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """One row for each CERPM."""
+        radio = asdict(commitment.radio)
+        for marker in markers:
+            detail = marker.detail
+            assert isinstance(detail, PlannedCerpm)
+            spec = {
+                "side": detail.side.name.lower(),
+                "speed_limit": speed_limit_document(detail.speed_limit),
+                "dev_eui": None,
+                "radio": radio,
+            }
+            columns = {
+                **commitment.position(marker),
+                "scheme": "cerpm",
+                "digits": str(detail.number),
+                "spec": spec,
+            }
+            yield PlannedRow(marker.number, columns)
+
+    def snapshot_columns(self) -> tuple[sa.ColumnElement[Any], ...]:
+        """Side, speed limit and interval."""
+        spec = markers.c.spec
+        radio = spec["radio"]
+        return (
+            spec["side"].as_string().label("side"),
+            spec["speed_limit"].label("speed_limit"),
+            radio["interval_s"].as_float().label("interval_s"),
+            radio["jitter_share"].as_float().label("jitter_share"),
+        )
+
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+        """Side, speed limit and the shortest interval between two transmissions."""
+        spec = row.spec
+        min_interval_s = spec["interval_s"] * (1 - spec["jitter_share"])
+        return {"side": spec["side"], "speed_limit": spec["speed_limit"], "min_interval_s": min_interval_s}
+
+    def snapshot_members(
+        self, connection: sa.Connection, agency_id: str, codes: Sequence[str]
+    ) -> Mapping[str, Sequence[Any]]:
+        """First and last transmission that was received from each."""
+        received = cerpms.list_span_ends(connection, agency_id, map(int, codes))
+        ends = [received.get(int(code)) for code in codes]
+        return {name: [None if end is None else getattr(end, name) for end in ends] for name in _SPAN}
 
 
 CERPM = Cerpms()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import secrets
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -21,12 +21,13 @@ from typing_extensions import TypedDict
 from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkOptions, Drawing, PlateReader
 from app.families.documents import FamilyChange, MarkerDocument, MarkerIn
-from app.families.surveys import MarkerRules, NewMarker, PlannedMarkers, SurveyImport
+from app.families.surveys import Commitment, MarkerRules, NewMarker, PlannedRow, SurveyImport
 from app.markers.reading import PlatePose
 from app.planning.outputs.hd_map import MapMarker
+from app.planning.plan import PlannedMarker
 from app.registry.database import Database
 from app.registry.lines import LineSource
-from app.registry.marker_rows import MarkerRow
+from app.registry.marker_rows import CodeRow, MarkerRow
 from app.registry.spatial import distance_m
 from app.sensors.camera import Camera
 
@@ -39,40 +40,6 @@ class ArtworkProof:
 
     digits: str
     confidence: float
-
-
-class MarkerArtwork(ABC):
-    """Drawings of a family's markers at true size."""
-
-    version: str  # changes when the same marker would get another drawing
-
-    @abstractmethod
-    def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
-        """The drawing of a marker, whose public page is at an address; without one it has no QR code.
-
-        Raises
-        ------
-        InvalidParameter
-            The family's artwork does not have these options.
-        """
-
-    @abstractmethod
-    def prove(self, row: MarkerRow, drawing: Drawing, read_plates: PlateReader) -> ArtworkProof:
-        """Render a drawing and read it back.
-
-        Raises
-        ------
-        ProofFailed
-            The drawing did not read back as its own code.
-        """
-
-
-@dataclass(frozen=True, slots=True)
-class MarkerSheet:
-    """Sheets of a family's markers for the crew."""
-
-    version: int  # goes up when the same marker would get another sheet
-    write: Callable[[MarkerRow, SheetFormat], bytes]  # the sheet of a marker in a format
 
 
 # === Parts of readings as clients see them, which every family has.
@@ -212,27 +179,6 @@ def distance_to_row(row: MarkerRow, position: ApproximatePosition) -> float:
     return distance_m(position.lon_deg, position.lat_deg, row.lon_deg, row.lat_deg)
 
 
-# === What vehicles without a connection get of a family's markers (docs/snapshots.md).
-
-
-class SnapshotRecord(ABC):
-    """A family's part of a snapshot."""
-
-    with_retired: bool = False  # whether retired markers are in snapshots too
-
-    def columns(self) -> tuple[sa.ColumnElement[Any], ...]:
-        """What is read of the spec of each marker, with labels; the whole spec without any."""
-        return ()
-
-    @abstractmethod
-    def kind(self, row: MarkerRow) -> dict[str, Any]:
-        """What a marker has in common with others of its kind; plain values."""
-
-    def members(self, connection: sa.Connection, agency_id: str, codes: Sequence[str]) -> Mapping[str, Sequence[Any]]:
-        """Further columns of markers with these codes, by the names of `write_snapshot`; None for a missing value."""
-        return {}
-
-
 # === What a family of markers declares. All other code asks the declaration; `app.families.FAMILIES` lists them.
 
 
@@ -255,22 +201,20 @@ class Family(ABC, Generic[New, Prepared]):
     """One family of markers: everything that distinguishes it from the others."""
 
     name: ClassVar[str]  # as it is stored and as clients send it
-    # `label`, `title`: one marker in a sentence, and the family in a heading
-    label: ClassVar[str]
-    title: ClassVar[str]
+    label: ClassVar[str]  # one marker in a sentence
+    title: ClassVar[str]  # the family in a heading
     schema: ClassVar[type[MarkerIn]]  # body of a request that registers a marker
     examples: ClassVar[Sequence[JsonValue]]  # bodies that the API's documentation shows
     change: ClassVar[type[FamilyChange] | None] = None  # members of a change that only this family has
-    snapshot: ClassVar[SnapshotRecord]  # what vehicles get of a marker in the snapshot of an area
-    lines: ClassVar[LineSource | None] = None  # lines that the family's markers make along a road
-    survey: ClassVar[SurveyImport[Any] | None] = None  # how points of a survey become the family's markers
-    artwork: ClassVar[MarkerArtwork | None] = None  # drawing of a marker at true size, for the workshop
-    frames: ClassVar[FrameReader[Any, Any] | None] = None  # how the family's markers are read in camera frames
-    sheet: ClassVar[MarkerSheet | None] = None  # sheet of a marker for the crew that builds it
-    planned: ClassVar[PlannedMarkers | None] = None  # how markers of a plan become the family's markers
-    # `document_type`, `detail_type`: shapes of a marker in lists and histories, and by itself
-    document_type: ClassVar[Any]
-    detail_type: ClassVar[Any]
+    document_type: ClassVar[Any]  # shape of a marker in lists and histories
+    detail_type: ClassVar[Any]  # shape of a marker by itself
+    has_index: ClassVar[bool] = False  # whether `index` stores something
+    in_snapshots_when_retired: ClassVar[bool] = False
+    artwork_version: ClassVar[str | None] = None  # another one if a marker would get another drawing; None: no artwork
+    sheet_version: ClassVar[int | None] = None  # the same for the crew's sheet
+    survey: ClassVar[SurveyImport[Any] | None] = None  # how points of a survey become its markers
+    frames: ClassVar[FrameReader[Any, Any] | None] = None  # how its markers are read in camera frames
+    lines: ClassVar[LineSource | None] = None  # lines that its markers make along a road
 
     # --- registering and changing ---------------------------------------------------------------------------------
 
@@ -341,6 +285,69 @@ class Family(ABC, Generic[New, Prepared]):
     def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
         """A marker as HD maps contain it: one point, where the family declares nothing else."""
         return (map_point(row),)
+
+    # --- what is built: the drawing at true size for the workshop, the sheet for the crew -------------------------
+
+    def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
+        """The drawing of a marker, whose public page is at an address; without one it has no QR code.
+
+        Raises
+        ------
+        InvalidParameter
+            The family's artwork does not have these options.
+        """
+        raise NotImplementedError(f"the family {self.name} has no artwork")
+
+    def prove(self, row: MarkerRow, drawing: Drawing, read_plates: PlateReader) -> ArtworkProof:
+        """Render a drawing and read it back.
+
+        Raises
+        ------
+        ProofFailed
+            The drawing did not read back as its own code.
+        """
+        raise NotImplementedError(f"the family {self.name} has no artwork")
+
+    def write_sheet(self, row: MarkerRow, form: SheetFormat) -> bytes:
+        """The sheet of a marker in a format."""
+        raise NotImplementedError(f"the family {self.name} has no sheet")
+
+    # --- plans ----------------------------------------------------------------------------------------------------
+
+    def planned_rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """Rows of the planned markers of this family, in the order of their numbers.
+
+        A row has the columns that differ from those of an empty marker.
+        """
+        raise NotImplementedError(f"no plan has markers of the family {self.name}")
+
+    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
+        """Registry numbers that planned markers may not have, because stored ones have them.
+
+        Parameters
+        ----------
+        agency_id : str
+            Of the plan.
+        known : iterable of rows
+            As `app.registry.markers.list_by_digits` returns them for the codes of the plan.
+        """
+        return set()
+
+    # --- snapshots: what vehicles without a connection get (docs/snapshots.md) ------------------------------------
+
+    def snapshot_columns(self) -> tuple[sa.ColumnElement[Any], ...]:
+        """What is read of the spec of each marker, with labels; the whole spec without any."""
+        return ()
+
+    @abstractmethod
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+        """What a marker has in common with others of its kind; plain values."""
+
+    def snapshot_members(
+        self, connection: sa.Connection, agency_id: str, codes: Sequence[str]
+    ) -> Mapping[str, Sequence[Any]]:
+        """Further columns of markers with these codes, by the names of `write_snapshot`; None for a missing value."""
+        return {}
 
 
 def map_point(row: MarkerRow, **members: Any) -> MapMarker:

@@ -34,13 +34,11 @@ from app.families.family import (
     ArtworkProof,
     Family,
     FrameReader,
-    MarkerArtwork,
     Match,
     Nearby,
     Pixels,
     PoseDocument,
     Registration,
-    SnapshotRecord,
     map_point,
     nearest_match,
     pose_document,
@@ -294,50 +292,6 @@ class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
         return {"confidence": float(reading.confidence), "bit_errors": int(reading.bit_errors)}
 
 
-# === Artwork of fiducial signs, proved by OpenCV's detector.
-
-
-class FiducialArtwork(MarkerArtwork):
-    """Drawings of fiducial signs."""
-
-    version = "fiducial/2"
-
-    def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
-        """The drawing of a sign.
-
-        Raises
-        ------
-        InvalidParameter
-            Heaters or light sources are asked for: signs have none.
-        """
-        if options.heaters or options.leds:
-            raise InvalidParameter(
-                "signs have no heaters and no light sources",
-                field="heaters" if options.heaters else "leds",
-                limit="plates only",
-                cure="leave it out",
-            )
-        order = FiducialOrder(row.id, fiducial_code(row), fiducial_geometry(row), record_url, row.version)
-        return encode_fiducial(order)
-
-    def prove(self, row: MarkerRow, drawing: Drawing, read_plates: PlateReader) -> ArtworkProof:
-        """Read a sign back with OpenCV's detector, which gives no confidence but right or wrong."""
-        code = fiducial_code(row)
-        prove_fiducial(drawing, code, fiducial_geometry(row))
-        return ArtworkProof(code.text, 1.0)
-
-
-# === Fiducial signs in the snapshot of an area.
-
-
-class FiducialSnapshot(SnapshotRecord):
-    """Dictionary, dimensions and mounting of signs; `app.decoders.fiducial` reads them on board."""
-
-    def kind(self, row: MarkerRow) -> dict[str, Any]:
-        """Dictionary, dimensions and mounting."""
-        return {"scheme": row.scheme, **row.spec}
-
-
 # === Surveys of fiducial signs.
 
 
@@ -444,9 +398,8 @@ class Fiducials(Family[NewFiducial, PlacedPosition]):
     title = "Fiducial signs"
     schema = FiducialIn
     examples = FIDUCIAL_EXAMPLES
-    snapshot = FiducialSnapshot()
+    artwork_version = "fiducial/2"
     survey = FiducialSurvey()
-    artwork = FiducialArtwork()
     frames = FiducialFrames()
     document_type = FiducialDocument
     detail_type = FiducialDocument
@@ -513,6 +466,34 @@ class Fiducials(Family[NewFiducial, PlacedPosition]):
         geometry = fiducial_geometry(row)
         upright = geometry.mounting is Mounting.UPRIGHT
         return (map_point(row, kind=row.scheme, side_m=geometry.side_mm / 1000, upright=upright),)
+
+    def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
+        """The drawing of a sign.
+
+        Raises
+        ------
+        InvalidParameter
+            Heaters or light sources are asked for: signs have none.
+        """
+        if options.heaters or options.leds:
+            raise InvalidParameter(
+                "signs have no heaters and no light sources",
+                field="heaters" if options.heaters else "leds",
+                limit="plates only",
+                cure="leave it out",
+            )
+        order = FiducialOrder(row.id, fiducial_code(row), fiducial_geometry(row), record_url, row.version)
+        return encode_fiducial(order)
+
+    def prove(self, row: MarkerRow, drawing: Drawing, read_plates: PlateReader) -> ArtworkProof:
+        """Read a sign back with OpenCV's detector, which gives no confidence but right or wrong."""
+        code = fiducial_code(row)
+        prove_fiducial(drawing, code, fiducial_geometry(row))
+        return ArtworkProof(code.text, 1.0)
+
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+        """Dictionary, dimensions and mounting; `app.decoders.fiducial` reads signs on board."""
+        return {"scheme": row.scheme, **row.spec}
 
 
 FIDUCIAL = Fiducials()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -124,31 +124,6 @@ class Commitment:
             "original": self.original(marker),
             **grade_columns(None, road.transform_accuracy_m, None),
         }
-
-
-class PlannedMarkers(ABC):
-    """The part of committing a plan that only one family knows."""
-
-    needs_index: ClassVar[bool] = False  # whether `Family.index` stores something for these markers
-
-    @abstractmethod
-    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
-        """Rows of the planned markers of this family, in the order of their numbers.
-
-        A row has the columns that differ from those of an empty marker.
-        """
-
-    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
-        """Registry numbers that planned markers may not have, because stored ones have them.
-
-        Parameters
-        ----------
-        agency_id : str
-            Of the plan.
-        known : iterable of rows
-            As `app.registry.markers.list_by_digits` returns them for the codes of the plan.
-        """
-        return set()
 
 
 # === How the points of a survey become markers of a family, thousands at a time.

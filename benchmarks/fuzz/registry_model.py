@@ -19,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 
 from app.errors import CodeTaken, StaleVersion
 from app.families.documents import PositionIn
-from app.families.plate.inputs import NewPlate
+from app.families.plate.plates import NewPlate
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
 from app.services.access.access import Access, Scope

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from app.families.cerpm import NewCerpm
 from app.families.documents import PositionIn
-from app.families.plate.inputs import CodeInput, NewPlate
+from app.families.plate.plates import CodeInput, NewPlate
 from app.markers.plate import PlateCode, PlateScheme
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.column_types import new_id, row_of

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 
 from app.errors import InvalidParameter, NotFound
 from app.families.documents import PositionIn
-from app.families.plate.inputs import NewPlate
+from app.families.plate.plates import NewPlate
 from app.registry import agencies, audit
 from app.registry.audit import Author, find_head, list_entries, record, recording, version_sha256
 from app.registry.database import Database

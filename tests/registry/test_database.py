@@ -15,7 +15,7 @@ from alembic.runtime.migration import MigrationContext
 
 from app.errors import ClientLeft, CodeTaken, Unavailable
 from app.families.documents import PositionIn
-from app.families.plate.inputs import CodeInput, NewPlate
+from app.families.plate.plates import CodeInput, NewPlate
 from app.markers.plate import PlateScheme
 from app.registry import agencies
 from app.registry.database import Database, head_revision

@@ -12,7 +12,7 @@ from app.encoders.magnet import CodebookRules
 from app.errors import StaleVersion
 from app.families.documents import PositionIn
 from app.families.magnet.layouts import LaneInput, NewMagnets, PlacedTag, TagInput
-from app.families.plate.inputs import NewPlate
+from app.families.plate.plates import NewPlate
 from app.markers.magnet_design import TagDesign
 from app.registry import agencies, markers
 from app.registry.database import Database

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from app.errors import CommitUnknown, StorageFull, Unavailable
 from app.families.documents import PositionIn
-from app.families.plate.inputs import NewPlate
+from app.families.plate.plates import NewPlate
 from app.registry import agencies
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope

@@ -57,7 +57,7 @@ from app.api.http.strict_json import StrictRoute, validated
 from app.errors import InvalidParameter, WaymarkError
 from app.families import FAMILIES, FAMILY_NAMES, union_of
 from app.families.documents import POSITION_EXAMPLE, Headed, MarkerIn, PositionIn, StrictModel
-from app.families.plate.inputs import PLATE_EXAMPLES
+from app.families.plate.plates import PLATE_EXAMPLES
 from app.markers.reading import Status
 from app.services.documents import cut_text
 from app.services.markers.bulk import BulkInput, BulkReport, Item, ItemProblem, MarkerUpdate

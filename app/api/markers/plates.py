@@ -18,7 +18,7 @@ from app.api.http.strict_json import StrictRoute
 from app.encoders.plate import ArtworkFormat, ArtworkOptions
 from app.errors import InvalidParameter, UnreadableUpload, naming
 from app.families.documents import POSITION_EXAMPLE, Flag, PositionIn, StrictModel
-from app.families.plate.inputs import (
+from app.families.plate.plates import (
     RECOMMENDED_SCHEME_NAME,
     SCHEME_DESCRIPTION,
     CodeIn,

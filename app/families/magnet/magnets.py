@@ -11,10 +11,10 @@ import numpy as np
 import scipy
 import sqlalchemy as sa
 
-from app.encoders.magnet import MagnetLayout, write_sheet
+from app.encoders.magnet import MagnetLayout, SheetFormat, write_sheet
 from app.errors import CodeMismatch, Conflict, InvalidParameter, naming
 from app.families.documents import PositionIn, position_columns
-from app.families.family import Family, MarkerSheet, Registration, SnapshotRecord
+from app.families.family import Family, Registration
 from app.families.magnet.documents import (
     MAGNET_EXAMPLES,
     MagnetDetailDocument,
@@ -45,7 +45,7 @@ from app.families.magnet.layouts import (
     sheet_of,
     worst_grade,
 )
-from app.families.surveys import PLAN_METHOD, Commitment, MarkerRules, PlannedMarkers, PlannedRow, is_placed_again
+from app.families.surveys import PLAN_METHOD, Commitment, MarkerRules, PlannedRow, is_placed_again
 from app.markers.magnet import MIN_GAP_M, InformationTag, LineStyle, LineTag, Orientation, Tag, parse_tag
 from app.markers.magnet_design import Meaning
 from app.planning.magnet_checks import HALF_BAR_M, Neighbour, Site
@@ -153,27 +153,6 @@ def magnets_of_map(row: MarkerRow) -> list[MapMarker]:
     ]  # fmt: skip
 
 
-# === Magnet markers in the snapshot of an area.
-
-
-class MagnetSnapshot(SnapshotRecord):
-    """Tag, meaning and the beginning of the lane of magnet markers."""
-
-    def columns(self) -> tuple[sa.ColumnElement[Any], ...]:
-        """Where the lane begins, and the meaning."""
-        spec = markers.c.spec
-        lane_start = spec["lane"]["points_deg"][0]
-        return (
-            lane_start[0].as_float().label("lane_lon_deg"),
-            lane_start[1].as_float().label("lane_lat_deg"),
-            spec["meaning"].label("meaning"),
-        )
-
-    def kind(self, row: MarkerRow) -> dict[str, Any]:
-        """Scheme and meaning."""
-        return {"scheme": row.scheme, "meaning": row.spec["meaning"]}
-
-
 # === Columns of a marker that is a tag or a line of magnets.
 
 
@@ -224,42 +203,28 @@ def magnet_columns(
 # === Planned magnets as rows of the registry: a tag is a marker, and so is a line of magnets at even distances.
 
 
-class PlannedMagnets(PlannedMarkers):
-    """Tags and lines of magnets."""
+def _planned_tag(commitment: Commitment, marker: PlannedMarker, detail: PlannedTag) -> PlannedRow:
+    lon, lat, along_m = lane_around(commitment.alignment.lane(marker.lane), marker)
+    lane_input = _lane_input(commitment, lon.tolist(), lat.tolist(), marker.height_m)
+    place = PlacedTag(along_m, marker.offset_m)
+    what = TagInput(place, code=detail.tag.text, codebook_id=commitment.codebook_id)
+    columns = magnet_columns(
+        NewMagnets(lane=lane_input, what=what), detail.tag, detail.meaning, commitment.rules, commitment.now
+    )
+    return PlannedRow(marker.number, columns | {"original": commitment.original(marker)})
 
-    needs_index = True
 
-    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
-        """One row for each tag, and one for each stretch of a line."""
-        for marker in markers:
-            if isinstance(marker.detail, PlannedTag):
-                yield self._tag(commitment, marker, marker.detail)
-        for stretch in even_stretches(markers, MAX_MAGNETS):
-            yield self._line(commitment, stretch)
-
-    def _tag(self, commitment: Commitment, marker: PlannedMarker, detail: PlannedTag) -> PlannedRow:
-        lon, lat, along_m = lane_around(commitment.alignment.lane(marker.lane), marker)
-        lane_input = _lane_input(commitment, lon.tolist(), lat.tolist(), marker.height_m)
-        place = PlacedTag(along_m, marker.offset_m)
-        what = TagInput(place, code=detail.tag.text, codebook_id=commitment.codebook_id)
-        columns = magnet_columns(
-            NewMagnets(lane=lane_input, what=what), detail.tag, detail.meaning, commitment.rules, commitment.now
-        )
-        return PlannedRow(marker.number, columns | {"original": commitment.original(marker)})
-
-    def _line(self, commitment: Commitment, stretch: Sequence[PlannedMarker]) -> PlannedRow:
-        lon, lat = [marker.lon_deg for marker in stretch], [marker.lat_deg for marker in stretch]
-        lane_input = _lane_input(commitment, lon, lat, stretch[0].height_m)
-        detail = stretch[0].detail
-        assert isinstance(detail, PlannedLineMagnet)
-        line = LaneLine.from_lon_lat(list(zip(lon, lat, strict=True)), stretch[0].height_m or 0.0)
-        spacing_m = spacing_of(line)
-        style = LineStyle.SOLID if detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
-        what = LineInput(PlacedLine(spacing_m=spacing_m), style)
-        columns = magnet_columns(
-            NewMagnets(lane=lane_input, what=what), detail.tag, None, commitment.rules, commitment.now
-        )
-        return PlannedRow(stretch[0].number, columns | {"original": commitment.original(stretch[0])}, len(stretch))
+def _planned_line(commitment: Commitment, stretch: Sequence[PlannedMarker]) -> PlannedRow:
+    lon, lat = [marker.lon_deg for marker in stretch], [marker.lat_deg for marker in stretch]
+    lane_input = _lane_input(commitment, lon, lat, stretch[0].height_m)
+    detail = stretch[0].detail
+    assert isinstance(detail, PlannedLineMagnet)
+    line = LaneLine.from_lon_lat(list(zip(lon, lat, strict=True)), stretch[0].height_m or 0.0)
+    spacing_m = spacing_of(line)
+    style = LineStyle.SOLID if detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
+    what = LineInput(PlacedLine(spacing_m=spacing_m), style)
+    columns = magnet_columns(NewMagnets(lane=lane_input, what=what), detail.tag, None, commitment.rules, commitment.now)
+    return PlannedRow(stretch[0].number, columns | {"original": commitment.original(stretch[0])}, len(stretch))
 
 
 def _lane_input(commitment: Commitment, lon: list[float], lat: list[float], height_m: float | None) -> LaneInput:
@@ -285,10 +250,9 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
     title = "Magnets"
     schema = MagnetIn
     examples = MAGNET_EXAMPLES
-    snapshot = MagnetSnapshot()
+    has_index = True
+    sheet_version = 1
     lines = MagnetLines()
-    planned = PlannedMagnets()
-    sheet = MarkerSheet(1, lambda row, form: write_sheet(sheet_of(row.id, row.spec), form))
     document_type = MagnetDocument
     detail_type = MagnetDetailDocument
 
@@ -379,6 +343,32 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
     def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
         """Each magnet."""
         return magnets_of_map(row)
+
+    def write_sheet(self, row: MarkerRow, form: SheetFormat) -> bytes:
+        """Where the magnets of a layout go."""
+        return write_sheet(sheet_of(row.id, row.spec), form)
+
+    def planned_rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """One row for each tag, and one for each stretch of a line."""
+        for marker in markers:
+            if isinstance(marker.detail, PlannedTag):
+                yield _planned_tag(commitment, marker, marker.detail)
+        for stretch in even_stretches(markers, MAX_MAGNETS):
+            yield _planned_line(commitment, stretch)
+
+    def snapshot_columns(self) -> tuple[sa.ColumnElement[Any], ...]:
+        """Where the lane begins, and the meaning."""
+        spec = markers.c.spec
+        lane_start = spec["lane"]["points_deg"][0]
+        return (
+            lane_start[0].as_float().label("lane_lon_deg"),
+            lane_start[1].as_float().label("lane_lat_deg"),
+            spec["meaning"].label("meaning"),
+        )
+
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+        """Scheme and meaning."""
+        return {"scheme": row.scheme, "meaning": row.spec["meaning"]}
 
 
 MAGNET = Magnets()

@@ -1,4 +1,4 @@
-"""Plates in camera frames and as artwork: what is looked for, which registered plate a reading is of, what is built."""
+"""Plates in camera frames: what is looked for, and which registered plate a reading is of."""
 
 from __future__ import annotations
 
@@ -12,15 +12,10 @@ import numpy.typing as npt
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
-from app.encoders.plate import ArtworkOptions, Drawing, PlateOrder, PlateReader, encode_plate, prove_plate
-from app.encoders.plate.bundle import ARTWORK_VERSION
-from app.encoders.plate.face import reference_text
 from app.errors import NotFound
 from app.families.family import (
     ApproximatePosition,
-    ArtworkProof,
     FrameReader,
-    MarkerArtwork,
     Match,
     Nearby,
     Pixels,
@@ -30,8 +25,6 @@ from app.families.family import (
     pose_document,
     rounded,
 )
-from app.families.plate.inputs import plate_code, plate_geometry
-from app.geodesy import UNFIT_TEXT
 from app.markers.plate import (
     EXPECTED_GEOMETRIES,
     PlateCode,
@@ -47,6 +40,22 @@ from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter
 from app.registry.spatial import distance_m
 from app.sensors.camera import Camera
+
+# === The row of a plate as values of the core.
+
+
+def plate_code(row: MarkerRow) -> PlateCode:
+    """Code of a plate's row."""
+    return PlateCode(row.digits, PlateScheme(row.scheme), row.n, row.check_digits or 1)
+
+
+def plate_geometry(row: MarkerRow) -> PlateGeometry:
+    """Geometry of a plate's row."""
+    return PlateGeometry(row.n, row.unit_mm, row.gap_mm, row.thickness_mm)
+
+
+# === Plates in camera frames.
+
 
 _MAX_ELSEWHERE = 500
 _M_PER_DEG = 111_000.0
@@ -319,46 +328,3 @@ def _reading_document(reading: PlateReading) -> PlateReadingDocument:
 
 def _corner_sigma_px(covariance: npt.NDArray[np.float64] | None) -> float | None:
     return None if covariance is None else float(np.sqrt(np.trace(covariance) / len(covariance)))
-
-
-# === Artwork of plates: their drawing, proved by the plate decoder.
-
-
-class PlateArtwork(MarkerArtwork):
-    """Drawings of plates."""
-
-    version = ARTWORK_VERSION
-
-    def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
-        """The drawing of a plate."""
-        return encode_plate(plate_order(row, record_url), options)
-
-    def prove(self, row: MarkerRow, drawing: Drawing, read_plates: PlateReader) -> ArtworkProof:
-        """Read a plate back with the plate decoder."""
-        proof = prove_plate(drawing, plate_code(row), plate_geometry(row), read_plates)
-        return ArtworkProof(proof.digits, proof.confidence)
-
-
-def plate_order(row: MarkerRow, record_url: str) -> PlateOrder:
-    """The plate of a row as the workshop is asked to make it."""
-    return PlateOrder(
-        plate_id=row.id,
-        code=plate_code(row),
-        geometry=plate_geometry(row),
-        record_url=record_url,
-        revision=row.version,
-        lon_deg=row.lon_deg,
-        lat_deg=row.lat_deg,
-        crs=reference_system(row),
-    )
-
-
-def reference_system(row: MarkerRow) -> str:
-    """Reference system for the margin, with a warning if the position is not for localization."""
-    warning = UNFIT_TEXT if is_unfit(row) else None
-    return reference_text(row.realization, row.epoch, warning)
-
-
-def is_unfit(row: MarkerRow) -> bool:
-    """Whether the position is not fit for localization."""
-    return row.localization_grade == "unfit"

@@ -1,28 +1,189 @@
-"""The family of plates: their codes, where these are free, and what follows when a plate moves."""
+"""The family of plates: requests and documents, codes and where these are free, surveys, plans, artwork, snapshots.
+
+How plates are read in camera frames is in `app.families.plate.frames`.
+"""
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 import sqlalchemy as sa
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from typing_extensions import TypedDict
 
-from app.errors import CodeMismatch, CodeTaken, InvalidParameter, naming
-from app.families.documents import MarkerDocument, marker_head, marker_place, place_input, position_columns
-from app.families.family import Family, Registration, SnapshotRecord, map_point
-from app.families.plate.frames import PlateArtwork, PlateFrames
-from app.families.plate.inputs import PLATE_EXAMPLES, CodeInput, NewPlate, PlateIn, plate_code, plate_geometry
-from app.families.plate.survey import PlateSurvey
-from app.families.surveys import PLANNED, Commitment, PlannedMarkers, PlannedRow, is_placed_again
-from app.geodesy import PlacedPosition
-from app.markers.plate import PlateCode, PlateScheme, plate_capacity
+from app.encoders.plate import ArtworkOptions, Drawing, PlateOrder, PlateReader, encode_plate, prove_plate
+from app.encoders.plate.bundle import ARTWORK_VERSION
+from app.encoders.plate.face import reference_text
+from app.errors import CodeMismatch, CodeTaken, InvalidParameter, WaymarkError, naming
+from app.families.documents import (
+    POSITION_EXAMPLE,
+    Headed,
+    MarkerDocument,
+    MarkerIn,
+    Number,
+    PositionIn,
+    StrictModel,
+    Text,
+    Whole,
+    marker_head,
+    marker_place,
+    place_input,
+    position_columns,
+)
+from app.families.family import ArtworkProof, Family, Registration, map_point
+from app.families.plate.frames import PlateFrames, plate_code, plate_geometry
+from app.families.surveys import (
+    PLANNED,
+    RETIRED,
+    Commitment,
+    Flags,
+    MarkerRules,
+    NewMarker,
+    PlannedRow,
+    RowCodes,
+    Rows,
+    SurveyImport,
+    is_placed_again,
+    listed_codes,
+)
+from app.formats.surveys.roles import CodeForm
+from app.formats.surveys.table import Fault
+from app.geodesy import UNFIT_TEXT, PlacedPosition
+from app.markers.plate import (
+    RECOMMENDED_SCHEME,
+    PlateCode,
+    PlateGeometry,
+    PlateScheme,
+    code_cells,
+    id_digits,
+    plate_capacity,
+    position_digits,
+    recommended_geometry,
+    registry_number_bits,
+)
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedMarker, PlannedPlate
 from app.registry import markers as store
+from app.registry.bulk_load import Columns
 from app.registry.marker_rows import CodeRow, MarkerRow
+from app.registry.spatial import distance_m
+from app.surveys.georeference import GeoreferencedSurvey
+
+# === A plate that is to be registered, as its use case knows it.
+
+
+@dataclass(frozen=True, slots=True)
+class CodeInput:
+    """The code that a plate is to have."""
+
+    scheme: PlateScheme = RECOMMENDED_SCHEME
+    digits: str | None = None
+    check_digits: int | None = None
+    registry_number: int | None = None
+    allow_mismatched_digits: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class NewPlate(NewMarker):
+    """A plate to register."""
+
+    family: ClassVar[str] = "plate"
+    position: PositionIn
+    code: CodeInput = field(default_factory=CodeInput)
+    geometry: PlateGeometry = field(default_factory=PlateGeometry)
+    heading_deg: float | None = None
+
+
+# === Schemas of requests that register plates.
+
+
+SchemeName = Literal["id", "position-robust", "position-check", "position"]
+RECOMMENDED_SCHEME_NAME: SchemeName = RECOMMENDED_SCHEME.value
+SCHEME_DESCRIPTION = (
+    "`id`: a registry number; `position-robust`: the position, on 10 x 10 or 12 x 12 units; both correct wrong cells. "
+    "`position-check` and `position` correct none."
+)
+
+
+class CodeIn(StrictModel):
+    """The plate's code; without digits they follow from the position or the registry number."""
+
+    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=SCHEME_DESCRIPTION)
+    digits: Text | None = Field(None, min_length=1, max_length=64, description="Digits to use instead of derived ones.")
+    check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] | None = Field(
+        None, description="For `position-check`: 1 (default) or 2."
+    )
+    registry_number: Annotated[int, Field(strict=True, ge=0, lt=2**64)] | None = Field(
+        None, description="For `id`: the number; allocated if left out."
+    )
+    allow_mismatched_digits: Annotated[bool, Field(strict=True)] = Field(
+        False, description="Store digits that do not fit the position; such a plate is found through the registry only."
+    )
+
+
+class GeometryIn(StrictModel):
+    """Dimensions of the plate."""
+
+    n: Whole | None = Field(
+        None, description="Units along a side: 8, 10 or 12. Without: 10 for the scheme `position-robust`, else 8."
+    )
+    unit_mm: Number | None = Field(
+        None, description="Side of a unit, 20 to 50. Without: 27 for `position-robust` on 10 x 10, else 35. [mm]"
+    )
+    gap_mm: Number = Field(5.0, description="Gap between units and round the border, 2 to 10. [mm]")
+    thickness_mm: Number = Field(20.0, description="Thickness of the base plate, 5 to 50. [mm]")
+
+    def geometry(self, scheme: PlateScheme) -> PlateGeometry:
+        """The dimensions as the core knows them, of a plate of a scheme."""
+        with naming("geometry"):
+            return recommended_geometry(
+                scheme, n=self.n, unit_mm=self.unit_mm, gap_mm=self.gap_mm, thickness_mm=self.thickness_mm
+            )
+
+
+PLATE_EXAMPLES: list[JsonValue] = [
+    {"position": POSITION_EXAMPLE, "heading_deg": 78.5, "status": "surveyed", "road": "Cheong Wan Road"},
+    {"position": POSITION_EXAMPLE, "code": {"scheme": "position-robust"}},
+    {"position": POSITION_EXAMPLE, "code": {"scheme": "position-check", "check_digits": 2}, "geometry": {"n": 10}},
+    {
+        "position": POSITION_EXAMPLE,
+        "code": {"scheme": "position", "digits": "023792168411", "allow_mismatched_digits": True},
+    },
+]
+
+
+class PlateIn(Headed, MarkerIn):
+    """A plate to register."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": PLATE_EXAMPLES})
+
+    family: Literal["plate"] = "plate"
+    position: PositionIn
+    code: CodeIn = Field(default_factory=CodeIn)
+    geometry: GeometryIn = Field(default_factory=GeometryIn)
+
+    def new(self) -> NewPlate:
+        """The plate as the use cases know it."""
+        code = self.code
+        return NewPlate(
+            position=self.position,
+            code=CodeInput(
+                PlateScheme(code.scheme),
+                code.digits,
+                code.check_digits,
+                code.registry_number,
+                code.allow_mismatched_digits,
+            ),
+            geometry=self.geometry.geometry(PlateScheme(code.scheme)),
+            heading_deg=self.heading_deg,
+            **self.shared(),
+        )
+
 
 # === Plates as clients see them.
 
@@ -186,58 +347,202 @@ def _check_code_request(wanted: CodeInput) -> None:
         )
 
 
-# === Planned plates as rows of the registry.
+# === Surveys of plates.
 
 
-class PlannedPlates(PlannedMarkers):
-    """Scheme, digits and dimensions."""
-
-    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
-        """A registry number names one plate of the whole server."""
-        ids = [row for row in known if row.scheme == PlateScheme.ID]
-        return {PlateCode(row.digits, PlateScheme.ID, row.n).registry_number for row in ids}
-
-    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
-        """One row for each plate."""
-        for marker in markers:
-            detail = marker.detail
-            assert isinstance(detail, PlannedPlate)
-            code, geometry = detail.code, detail.geometry
-            checks = code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else None
-            columns = {
-                **commitment.position(marker),
-                "scheme": str(code.scheme),
-                "digits": code.digits,
-                "check_digits": checks,
-                "digits_match_position": None if code.scheme is PlateScheme.ID else True,
-                "n": geometry.n,
-                "unit_mm": geometry.unit_mm,
-                "gap_mm": geometry.gap_mm,
-                "thickness_mm": geometry.thickness_mm,
-            }
-            yield PlannedRow(marker.number, columns)
+_LETTER_BYTES = np.frombuffer(b"ABCDEF", dtype=np.uint8)
+_MIN_LETTERS = 3  # in the digits of a registry number, so that they are not taken for a position
+_REDRAWS = 20
 
 
-# === Plates in the snapshot of an area.
+class PlateSurveyIn(BaseModel):
+    """Members of a survey's declaration that plates have."""
+
+    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=f"Of plates. {SCHEME_DESCRIPTION}")
+    check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] | None = None
+    geometry: GeometryIn = Field(default_factory=GeometryIn, description="Of plates.")
 
 
-_KIND = ("scheme", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm")
+@dataclass(frozen=True, slots=True)
+class PlateDefaults:
+    """What a survey's plates have in common."""
+
+    scheme: PlateScheme = RECOMMENDED_SCHEME
+    check_digits: int | None = None
+    geometry: PlateGeometry = field(default_factory=PlateGeometry)
+
+    @property
+    def checks(self) -> int:
+        """Check digits of position plates."""
+        return (self.check_digits or 1) if self.scheme is PlateScheme.POSITION_CHECK else 0
 
 
-class PlateSnapshot(SnapshotRecord):
-    """Code scheme and dimensions of plates."""
+class PlateSurvey(SurveyImport[PlateDefaults]):
+    """Points that become plates: their digits follow from the position, or are registry numbers."""
 
-    def kind(self, row: MarkerRow) -> dict[str, Any]:
+    members = PlateSurveyIn
+
+    def defaults(self, declared: Mapping[str, Any]) -> PlateDefaults:
+        """Scheme, check digits and dimensions."""
+        checks, scheme = declared.get("check_digits"), PlateScheme(declared.get("scheme", RECOMMENDED_SCHEME))
+        if checks is not None and scheme is not PlateScheme.POSITION_CHECK:
+            raise InvalidParameter(
+                "check_digits means nothing in this scheme", field="check_digits", limit="position-check"
+            )
+        with naming("geometry"):
+            geometry = recommended_geometry(scheme, **declared.get("geometry", {}))
+        return PlateDefaults(scheme, checks, geometry)
+
+    def code_form(self, defaults: PlateDefaults, *, compare: bool) -> CodeForm:
+        """Digits of the declared size and scheme, or registry numbers; digits of any plate in comparisons."""
+        cells = len(code_cells(defaults.geometry.n))
+        if compare:
+            return CodeForm("[0-9A-F]{5,}", True, "digits of plates")
+        if defaults.scheme is PlateScheme.ID:
+            pattern = f"[0-9A-F]{{{cells}}}|[0-9]{{1,{cells - 1}}}"
+            return CodeForm(pattern, True, f"{cells} digits of an id plate, or its registry number")
+        digits = "[0-9A-F]" if defaults.scheme.corrects else "[0-9]"
+        return CodeForm(f"{digits}{{{cells}}}", True, f"{cells} digits of a plate")
+
+    def read_codes(
+        self, survey: GeoreferencedSurvey, rows: Rows, defaults: PlateDefaults
+    ) -> tuple[RowCodes, list[Fault]]:
+        """Digits by the scheme."""
+        if defaults.scheme is PlateScheme.ID:
+            return _read_id_codes(survey, rows, defaults.geometry)
+        return _read_position_codes(survey, rows, defaults)
+
+    def is_unique(self, codes: RowCodes) -> bool:
+        """A registry number names one plate."""
+        return codes.scheme == PlateScheme.ID
+
+    def collides(
+        self,
+        codes: RowCodes,
+        defaults: PlateDefaults,
+        place: tuple[float, float],
+        known: CodeRow,
+        agency_id: str,
+        rules: MarkerRules,
+    ) -> bool:
+        """With any plate of the same registry number, or with one nearby of the same digits."""
+        if codes.scheme == PlateScheme.ID:
+            return known.scheme == "id" and known.n == defaults.geometry.n
+        if known.status == RETIRED:
+            return False
+        radius_m = rules.position_code_radius_m if known.digits_match_position else rules.explicit_code_radius_m
+        return distance_m(*place, known.lon_deg, known.lat_deg) <= radius_m
+
+    def columns(self, survey: GeoreferencedSurvey, codes: RowCodes, defaults: PlateDefaults) -> Columns:
         """Scheme and dimensions."""
-        return {name: getattr(row, name) for name in _KIND}
+        geometry = defaults.geometry
+        same = {
+            "scheme": codes.scheme,
+            "check_digits": defaults.checks or None,
+            "digits_match_position": None if defaults.scheme is PlateScheme.ID else True,
+            "n": geometry.n,
+            "unit_mm": geometry.unit_mm,
+            "gap_mm": geometry.gap_mm,
+            "thickness_mm": geometry.thickness_mm,
+        }
+        return Columns(len(codes.rows), same, {})
+
+
+def _read_position_codes(
+    survey: GeoreferencedSurvey, rows: Rows, defaults: PlateDefaults
+) -> tuple[RowCodes, list[Fault]]:
+    """Digits of position plates; a row whose digits are not those of its place is refused."""
+    placed = survey.placed
+    digits = position_digits(
+        placed.lon_deg[rows],
+        placed.lat_deg[rows],
+        n=defaults.geometry.n,
+        scheme=defaults.scheme,
+        check_digits=defaults.checks,
+    )
+    good = np.ones(len(rows), dtype=bool)
+    faults: list[Fault] = []
+    for k, text in listed_codes(survey, rows):
+        if text.encode() != digits[k]:
+            good[k] = False
+            message = f"the digits {text[:40]} are not those of the position, {digits[k].decode()}"
+            cure = (
+                "leave the digits out, correct the position, or declare compare if this measures a plate that is built"
+            )
+            faults.append(Fault(int(rows[k]) + 1, "code", "not_a_marker", message, cure))
+    return RowCodes(rows, digits, np.zeros(len(rows), dtype=bool), str(defaults.scheme)).of(good), faults
+
+
+def _read_id_codes(survey: GeoreferencedSurvey, rows: Rows, geometry: PlateGeometry) -> tuple[RowCodes, list[Fault]]:
+    """Digits of id plates, as digits or as registry numbers; drawn where the file has none."""
+    n, cells = geometry.n, PlateCode.from_registry_number(0, n=geometry.n).digits
+    digits = np.zeros(len(rows), dtype=f"S{len(cells)}")
+    good, from_file = np.ones(len(rows), dtype=bool), np.zeros(len(rows), dtype=bool)
+    faults: list[Fault] = []
+    for k, text in listed_codes(survey, rows):
+        is_number = text.isascii() and text.isdigit() and len(text) < len(cells)
+        try:
+            code = PlateCode.from_registry_number(int(text), n=n) if is_number else PlateCode(text, PlateScheme.ID, n)
+        except WaymarkError as error:
+            good[k] = False
+            faults.append(Fault(int(rows[k]) + 1, error.field or "code", "not_a_marker", error.message, error.cure))
+        else:
+            digits[k], from_file[k] = code.digits.encode(), True
+    codes = RowCodes(rows, digits, from_file, str(PlateScheme.ID)).of(good)
+    _draw(codes, ~codes.from_file, n)
+    return codes, faults
+
+
+def _draw(codes: RowCodes, wanted: Flags, n: int) -> None:
+    """Give rows random numbers, again where they are too like a decimal number or somebody else's in the file."""
+    for _ in range(_REDRAWS):
+        count = int(wanted.sum())
+        if not count:
+            return
+        drawn = np.frombuffer(secrets.token_bytes(8 * count), dtype=np.uint64)
+        codes.digits[wanted] = id_digits(drawn >> np.uint64(64 - registry_number_bits(n)), n=n)
+        letters = np.isin(codes.digits.view(np.uint8).reshape(len(codes.digits), -1), _LETTER_BYTES).sum(axis=1)
+        _values, first, count_of = np.unique(codes.digits, return_index=True, return_counts=True)
+        twice = np.ones(len(codes.digits), dtype=bool)
+        twice[first[count_of == 1]] = False
+        wanted = ~codes.from_file & ((letters < _MIN_LETTERS) | twice)
+    raise InvalidParameter("no registry numbers are left to draw", field="geometry.n", cure="take larger plates")
+
+
+# === Artwork of plates.
+
+
+def plate_order(row: MarkerRow, record_url: str) -> PlateOrder:
+    """The plate of a row as the workshop is asked to make it."""
+    return PlateOrder(
+        plate_id=row.id,
+        code=plate_code(row),
+        geometry=plate_geometry(row),
+        record_url=record_url,
+        revision=row.version,
+        lon_deg=row.lon_deg,
+        lat_deg=row.lat_deg,
+        crs=reference_system(row),
+    )
+
+
+def reference_system(row: MarkerRow) -> str:
+    """Reference system for the margin, with a warning if the position is not for localization."""
+    warning = UNFIT_TEXT if is_unfit(row) else None
+    return reference_text(row.realization, row.epoch, warning)
+
+
+def is_unfit(row: MarkerRow) -> bool:
+    """Whether the position is not fit for localization."""
+    return row.localization_grade == "unfit"
 
 
 # === The family of plates.
 
 
 _LETTERS = frozenset("ABCDEF")
-_MIN_LETTERS = 3
 _ALLOCATION_TRIES = 1000
+_KIND = ("scheme", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm")
 
 
 class Plates(Family[NewPlate, PlacedPosition]):
@@ -248,10 +553,8 @@ class Plates(Family[NewPlate, PlacedPosition]):
     title = "Plates"
     schema = PlateIn
     examples = PLATE_EXAMPLES
-    snapshot = PlateSnapshot()
+    artwork_version = ARTWORK_VERSION
     survey = PlateSurvey()
-    planned = PlannedPlates()
-    artwork = PlateArtwork()
     frames = PlateFrames()
     document_type = PlateDocument
     detail_type = PlateDocument
@@ -329,6 +632,44 @@ class Plates(Family[NewPlate, PlacedPosition]):
         coded = CodedPlate(code, matches, is_explicit)
         _check_free(connection, registration, coded, merged.lon_deg, merged.lat_deg, row.id)
         return {"digits": code.digits, "digits_match_position": matches}
+
+    def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
+        """The drawing of a plate."""
+        return encode_plate(plate_order(row, record_url), options)
+
+    def prove(self, row: MarkerRow, drawing: Drawing, read_plates: PlateReader) -> ArtworkProof:
+        """Read a plate back with the plate decoder."""
+        proof = prove_plate(drawing, plate_code(row), plate_geometry(row), read_plates)
+        return ArtworkProof(proof.digits, proof.confidence)
+
+    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
+        """A registry number names one plate of the whole server."""
+        ids = [row for row in known if row.scheme == PlateScheme.ID]
+        return {PlateCode(row.digits, PlateScheme.ID, row.n).registry_number for row in ids}
+
+    def planned_rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """One row for each plate."""
+        for marker in markers:
+            detail = marker.detail
+            assert isinstance(detail, PlannedPlate)
+            code, geometry = detail.code, detail.geometry
+            checks = code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else None
+            columns = {
+                **commitment.position(marker),
+                "scheme": str(code.scheme),
+                "digits": code.digits,
+                "check_digits": checks,
+                "digits_match_position": None if code.scheme is PlateScheme.ID else True,
+                "n": geometry.n,
+                "unit_mm": geometry.unit_mm,
+                "gap_mm": geometry.gap_mm,
+                "thickness_mm": geometry.thickness_mm,
+            }
+            yield PlannedRow(marker.number, columns)
+
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+        """Scheme and dimensions."""
+        return {name: getattr(row, name) for name in _KIND}
 
 
 PLATE = Plates()

@@ -95,17 +95,18 @@ def read_blocks(connection: sa.Connection, agency_id: str, box: Box, epoch: floa
     left = MAX_MARKERS
     for family in FAMILIES:
         found = (connection, agency_id, family.name, box)
-        left -= markers.count_for_snapshot(*found, with_retired=family.snapshot.with_retired, limit=left + 1)
+        left -= markers.count_for_snapshot(*found, with_retired=family.in_snapshots_when_retired, limit=left + 1)
         if left < 0:
             raise too_many_markers()
     for family in FAMILIES:
-        snapshot, found = family.snapshot, (connection, agency_id, family.name, box)
+        found = (connection, agency_id, family.name, box)
+        columns, with_retired = family.snapshot_columns(), family.in_snapshots_when_retired
         known: dict[tuple[object, ...], bytes] = {}
-        for block in markers.read_for_snapshot(*found, columns=snapshot.columns(), with_retired=snapshot.with_retired):
+        for block in markers.read_for_snapshot(*found, columns=columns, with_retired=with_retired):
             check_deadline()
             moved = _at_epoch(block, epoch)
             code, kind = block["digits"], _kinds(family, block, moved["localization_grade"].tolist(), known)
-            yield {**block, **moved, **snapshot.members(connection, agency_id, code), "code": code, "kind": kind}
+            yield {**block, **moved, **family.snapshot_members(connection, agency_id, code), "code": code, "kind": kind}
 
 
 def _at_epoch(block: Block, epoch: float) -> dict[str, Any]:
@@ -145,7 +146,7 @@ def _kinds(
         if (text := known.get(key)) is None:
             values = {name: block[name][k] for name in (*_SAME, *spec)}
             row = row_of(MarkerRow, {**values, "spec": values.get("spec", values)})
-            text = known[key] = kind_text(family.name, family.snapshot.kind(row) | {"transform_note": notes[k]})
+            text = known[key] = kind_text(family.name, family.snapshot_kind(row) | {"transform_note": notes[k]})
         found.append(text)
     return found
 

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from app.families.family import Match, Nearby
-from app.families.plate.inputs import plate_geometry
+from app.families.plate.frames import plate_geometry
 from app.families.plate.plates import PLATE
 from app.families.surveys import RETIRED
 from app.geodesy import decimal_year, enu_from_wgs84

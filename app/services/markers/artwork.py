@@ -22,9 +22,8 @@ from app.encoders.plate.bundle import NO_QR_CODE, bundle_manifest, plate_names
 from app.encoders.plate.writers import DEFAULT_DPI
 from app.errors import NotFound, Unavailable
 from app.families import FAMILIES, get_family
-from app.families.family import ArtworkProof, MarkerArtwork
-from app.families.plate.frames import is_unfit, plate_order
-from app.families.plate.plates import PLATE
+from app.families.family import ArtworkProof, Family
+from app.families.plate.plates import PLATE, is_unfit, plate_order
 from app.registry import jobs as registry_jobs
 from app.registry import markers as store
 from app.registry.column_types import new_id
@@ -96,8 +95,8 @@ class Artworks:
         NotFound
             There is no such marker, or its family has no artwork.
         """
-        row, artwork = self._get(caller, marker_id)
-        parts = (artwork.version, self._public_url, row.id, row.version, form, options, dpi)
+        row, family = self._get(caller, marker_id)
+        parts = (family.artwork_version, self._public_url, row.id, row.version, form, options, dpi)
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
     def artwork(
@@ -112,9 +111,9 @@ class Artworks:
         ProofFailed
             The drawing did not read back as its own code.
         """
-        row, artwork = self._get(caller, marker_id)
-        drawing = artwork.draw(row, options, record_url=page_url(self._public_url, row.id))
-        proof = artwork.prove(row, drawing, self._read)
+        row, family = self._get(caller, marker_id)
+        drawing = family.draw(row, options, record_url=page_url(self._public_url, row.id))
+        proof = family.prove(row, drawing, self._read)
         written = write_artwork(drawing, form, dpi=dpi)
         return Artwork(written.content, written.media_type, f"{row.id}-r{row.version}.{form}", proof, self.qr_code)
 
@@ -153,17 +152,17 @@ class Artworks:
             file, size, len(rows), sum(is_unfit(row) for row in rows), _lowest_confidence(manifest), self.qr_code
         )
 
-    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, MarkerArtwork]:
+    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, Any]]:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         family = get_family(row.family)
-        if family.artwork is None:
+        if family.artwork_version is None:
             raise NotFound(
                 f"marker {marker_id} is a {family.label}, which has no artwork",
                 field="marker_id",
-                limit=", ".join(family.name for family in FAMILIES if family.artwork is not None),
+                limit=", ".join(family.name for family in FAMILIES if family.artwork_version is not None),
             )
-        return row, family.artwork
+        return row, family
 
 
 def page_url(public_url: str, marker_id: str) -> str:

@@ -20,8 +20,7 @@ from app.encoders.plate.drawing import COLOURS, INKS
 from app.encoders.plate.face import UNIT_TOLERANCE_MM, reference_text, tile_mm
 from app.families.documents import PositionIn, place_input
 from app.families.family import ArtworkProof
-from app.families.plate.inputs import CodeInput
-from app.families.plate.plates import CodedPlate, PlateGeometryDocument, coded_plate
+from app.families.plate.plates import CodedPlate, CodeInput, PlateGeometryDocument, coded_plate
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, plate_capacity
 from app.planning.predict.rates import CameraPass, CameraView, PassFrame, camera_pass, check_view_size
 from app.planning.proof.report import Condition

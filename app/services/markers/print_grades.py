@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
-from app.families.plate.inputs import plate_code, plate_geometry
+from app.families.plate.frames import plate_code, plate_geometry
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.images import FIELD, ImageLimits, is_picture, unknown_picture

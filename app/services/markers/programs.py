@@ -15,7 +15,7 @@ from app.encoders.magnet import SheetFormat
 from app.errors import InvalidParameter, NotFound
 from app.families import get_family
 from app.families.cerpm import CERPM, message_of, radio_of
-from app.families.family import MarkerSheet
+from app.families.family import Family
 from app.families.surveys import RETIRED
 from app.geodesy import UNFIT_TEXT
 from app.markers.cerpm import MAX_SEQUENCE, derive_marker_key
@@ -220,19 +220,19 @@ class Layouts:
         NotFound
             There is no such marker, or its family has no layout.
         """
-        row, sheet = self._get(caller, marker_id)
-        parts = (sheet.version, row.id, row.version, str(form))
+        row, family = self._get(caller, marker_id)
+        parts = (family.sheet_version, row.id, row.version, str(form))
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
     def sheet(self, caller: Caller, marker_id: str, form: SheetFormat) -> LayoutFile:
         """Sheet of a marker; raises as `tag`."""
-        row, sheet = self._get(caller, marker_id)
-        return LayoutFile(sheet.write(row, form), form.media_type, f"{row.id}-r{row.version}.{form}")
+        row, family = self._get(caller, marker_id)
+        return LayoutFile(family.write_sheet(row, form), form.media_type, f"{row.id}-r{row.version}.{form}")
 
-    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, MarkerSheet]:
+    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, Any]]:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
-        sheet = get_family(row.family).sheet
-        if sheet is None:
+        family = get_family(row.family)
+        if family.sheet_version is None:
             raise NotFound(f"marker {marker_id} has no magnets", field="marker_id", limit="magnets have a layout")
-        return row, sheet
+        return row, family

@@ -383,11 +383,9 @@ class Plans:
         """Registry numbers of these codes that other markers have."""
         taken: set[int] = set()
         for family in FAMILIES:
-            if family.planned is None:
-                continue
             own = [code for name, code in codes if name == family.name]
             found = markers.list_by_digits(connection, family.name, own)
-            taken |= family.planned.taken_numbers(agency_id, found)
+            taken |= family.taken_numbers(agency_id, found)
         return taken
 
 
@@ -481,7 +479,7 @@ def _commit_markers(
             ids = new_ids(now, len(part), number)
             columns = _columns(part, ids, family.name, now)
             markers.add_markers(connection, entry, columns, kind=kind_of_new, why=f"plan {plan.name}")
-            if family.planned is not None and family.planned.needs_index:
+            if family.has_index:
                 for stored_row in columns.rows():
                     family.index(connection, caller.agency_id, row_of(MarkerRow, stored_row))
             stored += zip((planned.number for planned in part), ids, strict=True)
@@ -497,8 +495,7 @@ def _parts(
     for family in FAMILIES:
         own = [marker for marker in planned if marker.family == family.name]
         if own:
-            assert family.planned is not None, f"no plan has markers of the family {family.name}"
-            rows = list(family.planned.rows(commitment, own))
+            rows = list(family.planned_rows(commitment, own))
             yield from ((family, rows[start : start + _PART]) for start in range(0, len(rows), _PART))
 
 
