@@ -12,17 +12,8 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import access as agencies
-from app.api import access as audit
-from app.api import access as keys
-from app.api import access as me
-from app.api import drives, fleet, health, reprocessing, roads, uploads
-from app.api import jobs as events
-from app.api import jobs as files
-from app.api import jobs as job_routes
-from app.api import jobs as webhooks
+from app.api import access, drives, fleet, health, jobs, ogc, reprocessing, roads, uploads
 from app.api.decodes import decodes
-from app.api.decodes import decodes as decode_details
 from app.api.http import system, ui
 from app.api.http.compression import Compressed
 from app.api.http.limits import Budget, RateLimit, Slots
@@ -30,9 +21,9 @@ from app.api.http.middleware import Guarded, Observed
 from app.api.http.openapi import describe
 from app.api.http.permissions import Permissions
 from app.api.http.problems import install_problem_handlers
+from app.api.http.routes import permissions_of
 from app.api.jobs import Streams
 from app.api.markers import artwork, codebooks, markers, plates, searches
-from app.api.ogc import mount_ogc
 from app.api.plans import alignments, plans, radio_checks
 from app.api.public_pages import damage_reports, pages
 from app.api.public_pages.forms import MAX_FIELD_BYTES, public_limits
@@ -58,6 +49,10 @@ _LOG = structlog.get_logger("waymark")
 _FORM_BYTES = MAX_FIELD_BYTES * 16
 """Of a damage report besides the photo; a larger photo, up to here, is answered with the form. [byte]"""
 ROUTERS = (
+    *ogc.ROUTERS,  # first: a map view asks dozens of times, and trying all others takes as long as reading a page
+    ui.router,
+    system.router,
+    pages.router,
     searches.router,
     markers.bulk_router,
     markers.observation_router,
@@ -76,29 +71,29 @@ ROUTERS = (
     plans.proof_router,
     plans.package_router,
     plans.job_router,
-    job_routes.router,
-    files.file_router,
-    webhooks.webhook_router,
-    events.event_router,
+    jobs.router,
+    jobs.file_router,
+    jobs.webhook_router,
+    jobs.event_router,
     reprocessing.router,
     reprocessing.decode_versions,
     codebooks.router,
     codebooks.draft_router,
     decodes.router,
-    decode_details.detail_router,
+    decodes.detail_router,
     uploads.router,
     drives.router,
     surveys.import_router,
     surveys.export_router,
     fleet.snapshot_router,
-    audit.audit_router,
+    access.audit_router,
     fleet.vehicle_router,
     fleet.calibration_router,
-    keys.key_router,
-    agencies.agency_router,
+    access.key_router,
+    access.agency_router,
     damage_reports.settings_router,
     damage_reports.router,
-    me.me_router,
+    access.me_router,
     system.page_settings_router,
     system.server_settings_router,
 )
@@ -140,6 +135,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.server_settings = server_settings_of(settings, __version__)
     _add_routes(app)
     ui.mount_static(app, other_hosts(settings), settings.base_map_file, settings.guide_dir)
+    app.state.permissions = permissions_of(app.routes)
     app.add_middleware(Compressed)
     budget = Budget(settings.key_processor_s_per_min, settings.agency_processor_s_per_min)
     if isinstance(outside.queue, LocalQueue):  # with a broker, jobs run in other processes
@@ -222,9 +218,8 @@ def _control(database: Database, use_cases: UseCases) -> ControlServer | None:
 
 
 def _add_routes(app: FastAPI) -> None:
-    for router in (ui.router, system.router, pages.router, *ROUTERS):
+    for router in ROUTERS:
         app.router.routes += router.routes  # `include_router` would build all of them
-    mount_ogc(app)
     install_problem_handlers(app)
     describe(app)
 
@@ -247,7 +242,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access, budget: Budget)
             "/v1/uploads": settings.max_resumable_bytes,
             "/m/": settings.max_report_photo_bytes + _FORM_BYTES,
         },
-        permissions=Permissions(),
+        permissions=Permissions(app.state.permissions),
         body_timeout_s=settings.body_timeout_s,
         min_bytes_per_s=settings.min_bytes_per_s,
         budget=budget,
