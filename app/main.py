@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import access, drives, fleet, health, jobs, reprocessing, roads, uploads
+from app.api import access, drives, fleet, health, jobs, ogc, reprocessing, roads, uploads
 from app.api.decodes import decodes
 from app.api.http import system, ui
 from app.api.http.compression import Compressed
@@ -21,9 +21,9 @@ from app.api.http.middleware import Guarded, Observed
 from app.api.http.openapi import describe
 from app.api.http.permissions import Permissions
 from app.api.http.problems import install_problem_handlers
+from app.api.http.routes import permissions_of
 from app.api.jobs import Streams
 from app.api.markers import artwork, codebooks, markers, plates, searches
-from app.api.ogc import mount_ogc
 from app.api.plans import alignments, plans, radio_checks
 from app.api.public_pages import damage_reports, pages
 from app.api.public_pages.forms import MAX_FIELD_BYTES, public_limits
@@ -49,6 +49,10 @@ _LOG = structlog.get_logger("waymark")
 _FORM_BYTES = MAX_FIELD_BYTES * 16
 """Of a damage report besides the photo; a larger photo, up to here, is answered with the form. [byte]"""
 ROUTERS = (
+    *ogc.ROUTERS,  # first: a map view asks dozens of times, and trying all others takes as long as reading a page
+    ui.router,
+    system.router,
+    pages.router,
     searches.router,
     markers.bulk_router,
     markers.observation_router,
@@ -130,6 +134,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.server_settings = server_settings_of(settings, __version__)
     _add_routes(app)
     ui.mount_static(app, other_hosts(settings), settings.base_map_file, settings.guide_dir)
+    app.state.permissions = permissions_of(app.routes)
     app.add_middleware(Compressed)
     budget = Budget(settings.key_processor_s_per_min, settings.agency_processor_s_per_min)
     if isinstance(outside.queue, LocalQueue):  # with a broker, jobs run in other processes
@@ -208,9 +213,8 @@ def _control(database: Database, cases: UseCases) -> ControlServer | None:
 
 
 def _add_routes(app: FastAPI) -> None:
-    for router in (ui.router, system.router, pages.router, *ROUTERS):
+    for router in ROUTERS:
         app.router.routes += router.routes  # `include_router` would build all of them
-    mount_ogc(app)
     install_problem_handlers(app)
     describe(app)
 
@@ -233,7 +237,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access, budget: Budget)
             "/v1/uploads": settings.max_resumable_bytes,
             "/m/": settings.max_report_photo_bytes + _FORM_BYTES,
         },
-        permissions=Permissions(),
+        permissions=Permissions(app.state.permissions),
         body_timeout_s=settings.body_timeout_s,
         min_bytes_per_s=settings.min_bytes_per_s,
         budget=budget,

@@ -9,10 +9,10 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from app.api.http.permissions import PERMISSIONS
 from app.api.http.problems import PROBLEMS
+from app.api.http.routes import permissions_of
 from app.api.ogc.documents import api_document
-from app.main import create_app
+from app.main import ROUTERS, create_app
 from app.services.access.access import Scope
 from app.settings import Settings
 from guide.markdown import code, menu, table
@@ -29,6 +29,7 @@ from guide.schema_text import (
 _FOLDER = "reference/api"
 _SHARED = "schemas"
 _OGC_DOCUMENT = "ogc-document"
+_PERMISSIONS = permissions_of(route for router in ROUTERS for route in router.routes)
 
 
 class Operation(NamedTuple):
@@ -200,10 +201,7 @@ def _titled(title: str, text: str) -> str:
 
 
 def _scopes_text(operation: Operation) -> str:
-    allowed = PERMISSIONS.get(operation.route)
-    if allowed is None:
-        method = "GET" if operation.method == "head" else operation.method.upper()
-        allowed = PERMISSIONS[f"{method} {operation.path}"]
+    allowed = _PERMISSIONS[operation.route.replace("HEAD", "GET")]
     if not allowed:
         return "none is required."
     if allowed == frozenset(Scope):

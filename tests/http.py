@@ -8,7 +8,16 @@ from typing import Any, TypeVar
 
 import httpx
 
+from app.api.http.permissions import PUBLIC
+from app.api.http.routes import permissions_of
+from app.main import ROUTERS
+
 T = TypeVar("T")
+PERMISSIONS = {
+    **permissions_of(route for router in ROUTERS for route in router.routes),
+    **{f"GET {folder}": PUBLIC for folder in ("/static", "/guide")},
+}
+"""Who may use which route of an app."""
 WITHIN_S = 240.0
 """How long `wait_until` waits: far more than a loaded machine needs, less than the time limit of a test. [s]"""
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from datetime import timedelta
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Body, Depends, Path, Query, Request, Response
+from fastapi import Body, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator, ConfigDict, Field
 from typing_extensions import TypedDict
 
 from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, PageSize, Text, Whole, use_case
-from app.api.http.permissions import PERMISSIONS, PUBLIC
+from app.api.http.permissions import ADMINS, EVERYBODY, OPERATORS, PUBLIC, Allowed
 from app.api.http.problems import problem_responses
 from app.api.http.responses import Time, created_response, document_response, json_response, page_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.families.documents import StrictModel
 from app.registry.audit import EntryFilter
 from app.services.access.access import AGENCY_SCOPES, MAX_AGENCY_NAME, Access, Scope
@@ -32,7 +32,7 @@ from app.services.access.keys import MAX_OVERLAP, Agencies, Keys, NewKey
 # === /v1/audit: the log of what changed an agency's part of the registry.
 
 
-audit_router = APIRouter(prefix="/v1/audit", tags=["audit"], route_class=StrictRoute)
+audit_router = Router("/v1/audit", "audit")
 
 
 _NEWEST = 2**53 - 1
@@ -52,7 +52,7 @@ async def get_entry_filter(
     return EntryFilter(who, action, subject, since, until)
 
 
-@audit_router.get("", responses=document_response(AuditPage))
+@audit_router.get("", ADMINS | OPERATORS, responses=document_response(AuditPage))
 def list_audit_entries(
     request: Request,
     caller: Caller,
@@ -75,6 +75,7 @@ def list_audit_entries(
 
 @audit_router.post(
     "/verifications",
+    ADMINS,
     status_code=202,
     responses=document_response(
         VerificationDocument, 409, status=202, description="Queued; Location leads to its progress and result"
@@ -96,7 +97,7 @@ def post_verification(
     return response
 
 
-@audit_router.get("/verifications/{verification_id}", responses=document_response(VerificationDocument, 404))
+@audit_router.get("/verifications/{verification_id}", ADMINS, responses=document_response(VerificationDocument, 404))
 def get_verification(
     verification_id: Annotated[Identifier, Path(description="Id of the verification's job.")],
     caller: Caller,
@@ -114,7 +115,7 @@ def get_verification(
 # === /v1/keys: the keys of the agency, for its admins; those of operators, for operators.
 
 
-key_router = APIRouter(prefix="/v1/keys", tags=["access"], route_class=StrictRoute)
+key_router = Router("/v1/keys", "access")
 
 _DAY_S = 86_400
 NO_STORE = {"Cache-Control": "private, no-store"}
@@ -163,7 +164,8 @@ class RotationIn(StrictModel):
 Service = Annotated[Keys, use_case(lambda cases: cases.keys)]
 
 
-@key_router.post("", status_code=201, responses=document_response(NewKeyDocument, status=201))
+# an operator's key is created on the server's machine only
+@key_router.post("", ADMINS, status_code=201, responses=document_response(NewKeyDocument, status=201))
 def post_key(key: KeyIn, caller: Caller, keys: Service) -> Response:
     """Create a key.
 
@@ -172,7 +174,7 @@ def post_key(key: KeyIn, caller: Caller, keys: Service) -> Response:
     return _shown_once(keys.create(caller, NewKey(key.scope, key.label, key.expires_at)))
 
 
-@key_router.get("", responses=document_response(KeyPage))
+@key_router.get("", ADMINS | OPERATORS, responses=document_response(KeyPage))
 def list_keys(request: Request, caller: Caller, keys: Service, limit: PageSize = 100, after: LastId = None) -> Response:
     """List the keys of an agency.
 
@@ -182,13 +184,18 @@ def list_keys(request: Request, caller: Caller, keys: Service, limit: PageSize =
     return page_response(request, page, after=last)
 
 
-@key_router.get("/{key_id}", responses=document_response(KeyDocument, 404))
+@key_router.get("/{key_id}", ADMINS | OPERATORS, responses=document_response(KeyDocument, 404))
 def get_key(key_id: KeyId, caller: Caller, keys: Service) -> Response:
     """Get a key."""
     return json_response(keys.get(caller, key_id))
 
 
-@key_router.post("/{key_id}/rotate", status_code=201, responses=document_response(NewKeyDocument, 404, 409, status=201))
+@key_router.post(
+    "/{key_id}/rotate",
+    ADMINS | OPERATORS,
+    status_code=201,
+    responses=document_response(NewKeyDocument, 404, 409, status=201),
+)
 def rotate_key(key_id: KeyId, rotation: RotationIn, caller: Caller, keys: Service) -> Response:
     """Replace a key by a new one.
 
@@ -198,7 +205,7 @@ def rotate_key(key_id: KeyId, rotation: RotationIn, caller: Caller, keys: Servic
     return _shown_once(keys.rotate(caller, key_id, overlap=overlap, expires_at=rotation.expires_at))
 
 
-@key_router.delete("/{key_id}", status_code=204, responses=problem_responses(404, 409))
+@key_router.delete("/{key_id}", ADMINS | OPERATORS, status_code=204, responses=problem_responses(404, 409))
 def revoke_key(key_id: KeyId, caller: Caller, keys: Service) -> Response:
     """End a key now.
 
@@ -215,7 +222,7 @@ def _shown_once(document: NewKeyDocument) -> Response:
 # === GET /v1/me: who is calling, and what that caller may do.
 
 
-me_router = APIRouter(prefix="/v1/me", tags=["access"], route_class=StrictRoute)
+me_router = Router("/v1/me", "access")
 
 
 class MeDocument(TypedDict):
@@ -228,10 +235,20 @@ class MeDocument(TypedDict):
     permissions: Annotated[list[str], Field(description="Methods and path templates, e.g. `PATCH /v1/markers/{id}`.")]
 
 
-@me_router.get("", responses=document_response(MeDocument))
-def get_me(caller: Caller, access: Annotated[Access, use_case(lambda cases: cases.access)]) -> Response:
+async def get_permissions(request: Request) -> dict[str, Allowed]:
+    """Who may use each route."""
+    permissions: dict[str, Allowed] = request.app.state.permissions
+    return permissions
+
+
+@me_router.get("", EVERYBODY | OPERATORS, responses=document_response(MeDocument))
+def get_me(
+    caller: Caller,
+    access: Annotated[Access, use_case(lambda cases: cases.access)],
+    permissions: Annotated[dict[str, Allowed], Depends(get_permissions)],
+) -> Response:
     """Get the holder of the key or token of this request."""
-    allowed = [route for route, scopes in PERMISSIONS.items() if scopes != PUBLIC and caller.scope in scopes]
+    allowed = [route for route, scopes in permissions.items() if scopes != PUBLIC and caller.scope in scopes]
     document = MeDocument(
         agency=access.agency_name(caller),
         holder_id=caller.key_id,
@@ -245,7 +262,7 @@ def get_me(caller: Caller, access: Annotated[Access, use_case(lambda cases: case
 # === /v1/agencies: agencies with their first keys, created by the server's operator.
 
 
-agency_router = APIRouter(prefix="/v1/agencies", tags=["access"], route_class=StrictRoute)
+agency_router = Router("/v1/agencies", "access")
 
 AgenciesService = Annotated[Agencies, use_case(lambda cases: cases.agencies)]
 
@@ -265,7 +282,7 @@ class AgencyIn(StrictModel):
     )
 
 
-@agency_router.post("", status_code=201, responses=document_response(NewAgencyDocument, 409, status=201))
+@agency_router.post("", OPERATORS, status_code=201, responses=document_response(NewAgencyDocument, 409, status=201))
 def post_agency(agency: AgencyIn, caller: Caller, agencies: AgenciesService, idempotency: Idempotency) -> Response:
     """Create an agency with an admin key.
 
@@ -278,7 +295,7 @@ def post_agency(agency: AgencyIn, caller: Caller, agencies: AgenciesService, ide
     return json_response(document, 201, NO_STORE | ({"Idempotency-Replayed": "true"} if replayed else {}))
 
 
-@agency_router.get("", responses=document_response(AgencyPage))
+@agency_router.get("", OPERATORS, responses=document_response(AgencyPage))
 def list_agencies(request: Request, agencies: AgenciesService, limit: PageSize = 100, after: LastId = None) -> Response:
     """List the agencies of this server.
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
 from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_case
+from app.api.http.permissions import EVERYBODY, UPLOADERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -18,7 +19,7 @@ from app.api.http.responses import (
     json_response,
     page_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.errors import InvalidParameter
 from app.families.documents import Flag, StrictModel
 from app.registry.jobs import JobState
@@ -117,7 +118,7 @@ class DriveIn(StrictModel):
 # === /v1/drives: decodes of one drive become one track.
 
 
-router = APIRouter(prefix="/v1/drives", tags=["drives"], route_class=StrictRoute)
+router = Router("/v1/drives", "drives")
 
 DriveId = Annotated[Identifier, Path(description="Id of the drive.")]
 Drives = Annotated[DrivesService, use_case(lambda cases: cases.drives)]
@@ -125,6 +126,7 @@ Drives = Annotated[DrivesService, use_case(lambda cases: cases.drives)]
 
 @router.post(
     "",
+    UPLOADERS,
     status_code=202,
     responses={
         202: {"model": TrackedDriveDocument, "description": "Queued; Location leads to its progress and its track"},
@@ -143,7 +145,7 @@ def post_drive(body: DriveIn, caller: Caller, drives: Drives, key: Idempotency) 
     return response
 
 
-@router.get("", responses=document_response(DrivePage))
+@router.get("", EVERYBODY, responses=document_response(DrivePage))
 def list_drives(
     request: Request,
     caller: Caller,
@@ -161,7 +163,7 @@ def list_drives(
     return page_response(request, page, after=last)
 
 
-@router.get("/{drive_id}", responses=document_response(TrackedDriveDocument, 404))
+@router.get("/{drive_id}", EVERYBODY, responses=document_response(TrackedDriveDocument, 404))
 def get_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
     """Get a drive.
 
@@ -172,7 +174,7 @@ def get_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-@router.post("/{drive_id}/cancel", responses=document_response(TrackedDriveDocument, 404))
+@router.post("/{drive_id}/cancel", UPLOADERS, responses=document_response(TrackedDriveDocument, 404))
 def cancel_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
     """Cancel a drive.
 
@@ -181,7 +183,9 @@ def cancel_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
     return json_response(drives.cancel(caller, drive_id))
 
 
-@router.delete("/{drive_id}", status_code=204, responses=problem_responses(404, 409), response_class=Response)
+@router.delete(
+    "/{drive_id}", UPLOADERS, status_code=204, responses=problem_responses(404, 409), response_class=Response
+)
 def delete_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
     """Delete a finished drive with its track.
 
@@ -193,6 +197,7 @@ def delete_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
 
 @router.get(
     "/{drive_id}/track.{form}",
+    EVERYBODY,
     responses={
         **file_response([media_type for name, media_type in TRACK_FILES.items() if name.startswith("track")]),
         **NOT_MODIFIED,
@@ -214,7 +219,9 @@ def get_track(
 
 
 @router.get(
-    "/{drive_id}/plot.svg", responses={**file_response(["image/svg+xml"]), **NOT_MODIFIED, **problem_responses(404)}
+    "/{drive_id}/plot.svg",
+    EVERYBODY,
+    responses={**file_response(["image/svg+xml"]), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_track_plot(drive_id: DriveId, caller: Caller, drives: Drives, if_none_match: IfNoneMatch = None) -> Response:
     """Get the plot of a drive's track.

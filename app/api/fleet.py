@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import Depends, Path, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue, field_validator
 
 from app.api.decodes.schemas import CameraIn, FramesIn, PacketsIn, TraceIn
@@ -24,6 +24,7 @@ from app.api.http.dependencies import (
     Whole,
     use_case,
 )
+from app.api.http.permissions import ADMINS, EVERYBODY, PLANNERS, READERS, SURVEYORS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -35,7 +36,7 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
 from app.errors import InvalidParameter, UnreadableUpload
@@ -94,7 +95,7 @@ class CalibrationIn(StrictModel):
 # === /v1/calibration-boards: boards to print; /v1/calibrations: photos of them -> the camera's intrinsics.
 
 
-calibration_router = APIRouter(prefix="/v1", tags=["fleet"], route_class=StrictRoute)
+calibration_router = Router("/v1", "fleet")
 
 MAX_DECLARATION_BYTES = 16 * 1024
 _CURE = "send multipart/form-data with several parts photos, or one ZIP of them, and a part declaration"
@@ -151,6 +152,7 @@ Asked = Annotated[_Asked, Depends(get_asked)]
 
 @calibration_router.get(
     "/calibration-boards/board.{form}",
+    READERS,
     responses={**file_response(form.media_type for form in ArtworkFormat), **problem_responses()},
 )
 def get_board(
@@ -174,6 +176,8 @@ def get_board(
 
 @calibration_router.post(
     "/calibrations",
+    SURVEYORS,
+    expensive=True,
     status_code=201,
     openapi_extra=_BODY,
     responses=document_response(CalibrationDocument, 409, 415, status=201, description="Calibrated"),
@@ -192,7 +196,7 @@ def post_calibration(caller: Caller, asked: Asked, calibrations: CalibrationServ
     return created_response(document, replayed, path="/v1/calibrations")
 
 
-@calibration_router.get("/calibrations", responses=document_response(CalibrationPage))
+@calibration_router.get("/calibrations", READERS, responses=document_response(CalibrationPage))
 def list_calibrations(
     request: Request,
     caller: Caller,
@@ -208,7 +212,9 @@ def list_calibrations(
     return page_response(request, page, after=last)
 
 
-@calibration_router.get("/calibrations/{calibration_id}", responses=document_response(CalibrationDocument, 404))
+@calibration_router.get(
+    "/calibrations/{calibration_id}", READERS, responses=document_response(CalibrationDocument, 404)
+)
 def get_calibration(
     calibration_id: Annotated[Identifier, Path(description="Id of the calibration.")],
     caller: Caller,
@@ -339,7 +345,7 @@ class CalibrationChoice(StrictModel):
 # === /v1/vehicles: the fleet, its sensor profiles and the keys that speak for it.
 
 
-vehicle_router = APIRouter(prefix="/v1/vehicles", tags=["fleet"], route_class=StrictRoute)
+vehicle_router = Router("/v1/vehicles", "fleet")
 
 VehicleId = Annotated[Identifier, Path(description="Id of the vehicle.")]
 KeyId = Annotated[Text, Path(min_length=1, max_length=200, description="Id of the key, as GET /v1/keys lists it.")]
@@ -347,7 +353,10 @@ VehicleService = Annotated[Vehicles, use_case(lambda cases: cases.vehicles)]
 
 
 @vehicle_router.post(
-    "", status_code=201, responses=document_response(VehicleDocument, 404, 409, status=201, description="Added")
+    "",
+    PLANNERS,
+    status_code=201,
+    responses=document_response(VehicleDocument, 404, 409, status=201, description="Added"),
 )
 def post_vehicle(vehicle: VehicleIn, caller: Caller, vehicles: VehicleService, idempotency: Idempotency) -> Response:
     """Add a vehicle with its sensor profile.
@@ -358,7 +367,7 @@ def post_vehicle(vehicle: VehicleIn, caller: Caller, vehicles: VehicleService, i
     return created_response(document, replayed, path="/v1/vehicles")
 
 
-@vehicle_router.get("", responses=document_response(VehiclePage))
+@vehicle_router.get("", READERS, responses=document_response(VehiclePage))
 def list_vehicles(
     request: Request,
     caller: Caller,
@@ -375,7 +384,7 @@ def list_vehicles(
     return page_response(request, page, after=last)
 
 
-@vehicle_router.get("/{vehicle_id}", responses=document_response(VehicleDocument, 404))
+@vehicle_router.get("/{vehicle_id}", READERS, responses=document_response(VehicleDocument, 404))
 def get_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleService) -> Response:
     """Get a vehicle.
 
@@ -384,7 +393,7 @@ def get_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleService)
     return versioned_response(vehicles.get(caller, vehicle_id))
 
 
-@vehicle_router.patch("/{vehicle_id}", responses=document_response(VehicleDocument, 404, 409, 412, 428))
+@vehicle_router.patch("/{vehicle_id}", PLANNERS, responses=document_response(VehicleDocument, 404, 409, 412, 428))
 def patch_vehicle(
     vehicle_id: VehicleId, patch: VehiclePatch, caller: Caller, vehicles: VehicleService, version: Version
 ) -> Response:
@@ -395,7 +404,7 @@ def patch_vehicle(
     return versioned_response(vehicles.change(caller, vehicle_id, patch.change(), version))
 
 
-@vehicle_router.delete("/{vehicle_id}", status_code=204, responses=problem_responses(404, 412, 428))
+@vehicle_router.delete("/{vehicle_id}", PLANNERS, status_code=204, responses=problem_responses(404, 412, 428))
 def delete_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleService, version: Version) -> Response:
     """Retire a vehicle.
 
@@ -405,7 +414,7 @@ def delete_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleServi
     return Response(status_code=204)
 
 
-@vehicle_router.get("/{vehicle_id}/versions", responses=document_response(VehicleVersionPage, 404))
+@vehicle_router.get("/{vehicle_id}/versions", READERS, responses=document_response(VehicleVersionPage, 404))
 def list_vehicle_versions(
     vehicle_id: VehicleId,
     request: Request,
@@ -422,7 +431,7 @@ def list_vehicle_versions(
     return page_response(request, page, after=last)
 
 
-@vehicle_router.put("/{vehicle_id}/calibration", responses=document_response(VehicleDocument, 404, 412, 428))
+@vehicle_router.put("/{vehicle_id}/calibration", PLANNERS, responses=document_response(VehicleDocument, 404, 412, 428))
 def put_calibration(
     vehicle_id: VehicleId, choice: CalibrationChoice, caller: Caller, vehicles: VehicleService, version: Version
 ) -> Response:
@@ -433,7 +442,7 @@ def put_calibration(
     return versioned_response(vehicles.put_calibration(caller, vehicle_id, choice.calibration_id, version))
 
 
-@vehicle_router.put("/{vehicle_id}/keys/{key_id}", responses=document_response(VehicleDocument, 404, 409))
+@vehicle_router.put("/{vehicle_id}/keys/{key_id}", ADMINS, responses=document_response(VehicleDocument, 404, 409))
 def put_vehicle_key(vehicle_id: VehicleId, key_id: KeyId, caller: Caller, vehicles: VehicleService) -> Response:
     """Let a key speak for a vehicle.
 
@@ -442,7 +451,7 @@ def put_vehicle_key(vehicle_id: VehicleId, key_id: KeyId, caller: Caller, vehicl
     return versioned_response(vehicles.link_key(caller, vehicle_id, key_id))
 
 
-@vehicle_router.delete("/{vehicle_id}/keys/{key_id}", status_code=204, responses=problem_responses(404))
+@vehicle_router.delete("/{vehicle_id}/keys/{key_id}", ADMINS, status_code=204, responses=problem_responses(404))
 def delete_vehicle_key(vehicle_id: VehicleId, key_id: KeyId, caller: Caller, vehicles: VehicleService) -> Response:
     """Let a key speak for a vehicle no longer.
 
@@ -455,11 +464,16 @@ def delete_vehicle_key(vehicle_id: VehicleId, key_id: KeyId, caller: Caller, veh
 # === /v1/snapshots: what vehicles take along.
 
 
-snapshot_router = APIRouter(prefix="/v1/snapshots", tags=["snapshots"], route_class=StrictRoute)
+snapshot_router = Router("/v1/snapshots", "snapshots")
 Snapshots = Annotated[SnapshotsService, use_case(lambda cases: cases.snapshots)]
 
 
-@snapshot_router.get("", responses={**file_response([MEDIA_TYPE], "See docs/snapshots.md"), **problem_responses()})
+@snapshot_router.get(
+    "",
+    EVERYBODY,  # vehicles without a connection decode with it
+    expensive=True,
+    responses={**file_response([MEDIA_TYPE], "See docs/snapshots.md"), **problem_responses()},
+)
 def get_snapshot(
     caller: Caller,
     snapshots: Snapshots,
@@ -478,7 +492,7 @@ def get_snapshot(
     return Response(snapshots.make(caller, parse_box(bbox), hours), headers=headers, media_type=MEDIA_TYPE)
 
 
-@snapshot_router.get("/trust", responses=document_response(TrustDocument))
+@snapshot_router.get("/trust", EVERYBODY, responses=document_response(TrustDocument))
 def get_trust(caller: Caller, snapshots: Snapshots) -> Response:
     """Get the keys that snapshots are verified with.
 

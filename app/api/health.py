@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.http.dependencies import AfterLink, Caller, MarkerId, PageSize, SentVersion, Text, use_case
+from app.api.http.permissions import READERS, SURVEYORS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import cursor_of, document_response, file_response, json_response, page_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.families import FamilyName
 from app.families.documents import Identifier
 from app.registry.health import ItemFilter
@@ -23,7 +24,7 @@ from app.services.request_work import counted_steps
 # === /v1/maintenance: faults of markers that vehicles show, and the decisions of people on them.
 
 
-router = APIRouter(prefix="/v1", tags=["marker health"], route_class=StrictRoute)
+router = Router("/v1", "marker health")
 
 MEDIA_TYPES = {"geojson": "application/geo+json", "csv": "text/csv"}
 ItemId = Annotated[Identifier, Path(description="Id of the item.")]
@@ -78,7 +79,7 @@ class DismissalIn(BaseModel):
     note: Text = Field(min_length=1, max_length=300)
 
 
-@router.get("/maintenance", responses=document_response(MaintenancePage))
+@router.get("/maintenance", READERS, responses=document_response(MaintenancePage))
 def list_maintenance(
     request: Request,
     caller: Caller,
@@ -97,7 +98,7 @@ def list_maintenance(
     return page_response(request, page, after=last)
 
 
-@router.get("/maintenance.{form}", responses={**file_response(MEDIA_TYPES.values()), **problem_responses()})
+@router.get("/maintenance.{form}", READERS, responses={**file_response(MEDIA_TYPES.values()), **problem_responses()})
 def get_maintenance_file(
     form: Literal["geojson", "csv"], caller: Caller, maintenance: Maintenance, filtered: Filtered
 ) -> Response:
@@ -110,7 +111,7 @@ def get_maintenance_file(
     return StreamingResponse(parts, headers=headers, media_type=MEDIA_TYPES[form])
 
 
-@router.get("/maintenance/{item_id}", responses=document_response(MaintenanceItem, 404))
+@router.get("/maintenance/{item_id}", READERS, responses=document_response(MaintenanceItem, 404))
 def get_maintenance_item(item_id: ItemId, caller: Caller, maintenance: Maintenance) -> Response:
     """Get an item of the work list.
 
@@ -119,7 +120,7 @@ def get_maintenance_item(item_id: ItemId, caller: Caller, maintenance: Maintenan
     return json_response(maintenance.get(caller, item_id))
 
 
-@router.post("/maintenance/{item_id}/approve", responses=document_response(MaintenanceItem, 404, 409, 412))
+@router.post("/maintenance/{item_id}/approve", SURVEYORS, responses=document_response(MaintenanceItem, 404, 409, 412))
 def approve_maintenance_item(
     item_id: ItemId, approval: ApprovalIn, caller: Caller, maintenance: Maintenance, version: SentVersion
 ) -> Response:
@@ -132,7 +133,7 @@ def approve_maintenance_item(
     return json_response(maintenance.approve(caller, item_id, approval.outcome, approval.note, version))
 
 
-@router.post("/maintenance/{item_id}/dismiss", responses=document_response(MaintenanceItem, 404, 409))
+@router.post("/maintenance/{item_id}/dismiss", SURVEYORS, responses=document_response(MaintenanceItem, 404, 409))
 def dismiss_maintenance_item(
     item_id: ItemId, dismissal: DismissalIn, caller: Caller, maintenance: Maintenance
 ) -> Response:
@@ -143,7 +144,7 @@ def dismiss_maintenance_item(
     return json_response(maintenance.dismiss(caller, item_id, dismissal.note))
 
 
-@router.get("/markers/{marker_id}/health", responses=document_response(HealthDocument, 404))
+@router.get("/markers/{marker_id}/health", READERS, responses=document_response(HealthDocument, 404))
 def get_marker_health(marker_id: MarkerId, caller: Caller, maintenance: Maintenance) -> Response:
     """Get the health of a marker.
 

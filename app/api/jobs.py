@@ -12,13 +12,14 @@ from typing import Annotated, Generic, Protocol, TypeVar
 import anyio
 import structlog
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http import event_stream
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
 from app.api.http.event_stream import EventStream, LastEventId, ServerEvent, StreamPlaces
+from app.api.http.permissions import EVERYBODY, PLANNERS, READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -30,7 +31,7 @@ from app.api.http.responses import (
     page_response,
     text_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.errors import InvalidParameter, Unavailable
 from app.families.documents import StrictModel
 from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState
@@ -235,13 +236,13 @@ SharedStreams = Annotated[Streams, Depends(get_streams)]
 # === /v1/jobs: work that goes on after its request was answered, of every kind.
 
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=StrictRoute)
+router = Router("/v1/jobs", "jobs")
 
 JobId = Annotated[Identifier, Path(description="Id of the job.")]
 Service = Annotated[AllJobs, use_case(lambda cases: cases.all_jobs)]
 
 
-@router.get("", responses=document_response(JobPage))
+@router.get("", EVERYBODY, responses=document_response(JobPage))
 def list_jobs(
     request: Request,
     caller: Caller,
@@ -262,7 +263,7 @@ def list_jobs(
     return page_response(request, page, after=last)
 
 
-@router.get("/{job_id}", responses=document_response(JobDocument, 404))
+@router.get("/{job_id}", EVERYBODY, responses=document_response(JobDocument, 404))
 def get_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
     """Get a job with its progress.
 
@@ -273,7 +274,8 @@ def get_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-@router.post("/{job_id}/cancel", responses=document_response(JobDocument, 404, 409))
+# viewers cancel artwork and exports that they asked for; app/services/progress.py says which kinds a scope sees
+@router.post("/{job_id}/cancel", EVERYBODY, responses=document_response(JobDocument, 404, 409))
 def cancel_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
     """Cancel a job.
 
@@ -286,6 +288,7 @@ def cancel_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
 
 @router.get(
     "/{job_id}/events",
+    EVERYBODY,
     responses={
         **text_response(event_stream.MEDIA_TYPE, "Events `progress`, and a last one `done`, `failed` or `cancelled`"),
         204: {"description": "The last event has been seen: do not connect again"},
@@ -344,7 +347,7 @@ def _event(follower: JobFollower, clock: Clock) -> ServerEvent:
 # === /v1/jobs/{job_id}/result: files that jobs have made.
 
 
-file_router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=StrictRoute)
+file_router = Router("/v1/jobs", "jobs")
 
 _TYPES = dict.fromkeys(media.partition(";")[0] for media in ("application/zip", *(STREAMED | WHOLE).values()))
 
@@ -358,6 +361,7 @@ def queued_job(job: JobDocument, replayed: bool) -> Response:
 
 @file_router.get(
     "/{job_id}/result",
+    READERS,
     response_class=StreamingResponse,
     responses={**file_response(_TYPES), **NOT_MODIFIED, **problem_responses(404, 409)},
 )
@@ -386,7 +390,7 @@ def get_job_result(
 # === /v1/events: what happens in an agency, as it happens.
 
 
-event_router = APIRouter(prefix="/v1/events", tags=["events"], route_class=StrictRoute)
+event_router = Router("/v1/events", "events")
 
 _MAX_DIGITS = 18
 EventService = Annotated[AgencyEvents, use_case(lambda cases: cases.agency_events)]
@@ -394,6 +398,7 @@ EventService = Annotated[AgencyEvents, use_case(lambda cases: cases.agency_event
 
 @event_router.get(
     "",
+    EVERYBODY,
     responses={
         200: {
             "model": EventPage,
@@ -458,7 +463,7 @@ def _number(last_event_id: str) -> int:
 # === /v1/webhooks: addresses that are sent the agency's events.
 
 
-webhook_router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], route_class=StrictRoute)
+webhook_router = Router("/v1/webhooks", "webhooks")
 
 WebhookId = Annotated[Identifier, Path(description="Id of the webhook.")]
 DeliveryId = Annotated[Identifier, Path(description="Id of the delivery, the header `webhook-id`.")]
@@ -478,7 +483,7 @@ class WebhookIn(StrictModel):
     )
 
 
-@webhook_router.post("", status_code=201, responses=document_response(NewWebhookDocument, 409, status=201))
+@webhook_router.post("", PLANNERS, status_code=201, responses=document_response(NewWebhookDocument, 409, status=201))
 def post_webhook(webhook: WebhookIn, caller: Caller, webhooks: WebhookService) -> Response:
     """Register a webhook.
 
@@ -491,26 +496,26 @@ def post_webhook(webhook: WebhookIn, caller: Caller, webhooks: WebhookService) -
     return json_response(document, 201, headers)
 
 
-@webhook_router.get("", responses=document_response(WebhookList))
+@webhook_router.get("", PLANNERS, responses=document_response(WebhookList))
 def list_webhooks(caller: Caller, webhooks: WebhookService) -> Response:
     """List the webhooks of an agency."""
     return json_response(webhooks.all(caller))
 
 
-@webhook_router.get("/{webhook_id}", responses=document_response(WebhookDocument, 404))
+@webhook_router.get("/{webhook_id}", PLANNERS, responses=document_response(WebhookDocument, 404))
 def get_webhook(webhook_id: WebhookId, caller: Caller, webhooks: WebhookService) -> Response:
     """Get a webhook."""
     return json_response(webhooks.get(caller, webhook_id))
 
 
-@webhook_router.delete("/{webhook_id}", status_code=204, responses=problem_responses(404))
+@webhook_router.delete("/{webhook_id}", PLANNERS, status_code=204, responses=problem_responses(404))
 def delete_webhook(webhook_id: WebhookId, caller: Caller, webhooks: WebhookService) -> Response:
     """Delete a webhook with its deliveries."""
     webhooks.delete(caller, webhook_id)
     return Response(status_code=204)
 
 
-@webhook_router.post("/{webhook_id}/enable", responses=document_response(WebhookDocument, 404))
+@webhook_router.post("/{webhook_id}/enable", PLANNERS, responses=document_response(WebhookDocument, 404))
 def enable_webhook(webhook_id: WebhookId, caller: Caller, webhooks: WebhookService) -> Response:
     """Enable a webhook again.
 
@@ -519,7 +524,7 @@ def enable_webhook(webhook_id: WebhookId, caller: Caller, webhooks: WebhookServi
     return json_response(webhooks.enable(caller, webhook_id))
 
 
-@webhook_router.get("/{webhook_id}/deliveries", responses=document_response(DeliveryPage, 404))
+@webhook_router.get("/{webhook_id}/deliveries", PLANNERS, responses=document_response(DeliveryPage, 404))
 def list_deliveries(
     request: Request,
     webhook_id: WebhookId,
@@ -538,7 +543,9 @@ def list_deliveries(
 
 
 @webhook_router.post(
-    "/{webhook_id}/deliveries/{delivery_id}/redeliver", responses=document_response(DeliveryDocument, 404, 409)
+    "/{webhook_id}/deliveries/{delivery_id}/redeliver",
+    PLANNERS,
+    responses=document_response(DeliveryDocument, 404, 409),
 )
 def redeliver(webhook_id: WebhookId, delivery_id: DeliveryId, caller: Caller, webhooks: WebhookService) -> Response:
     """Send a delivery of a webhook again.

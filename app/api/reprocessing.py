@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import Path, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http.dependencies import Caller, Identifier, LastId, Number, PageSize, Text, use_case
+from app.api.http.permissions import ADMINS, EVERYBODY
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     Time,
@@ -18,7 +19,7 @@ from app.api.http.responses import (
     json_response,
     page_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.families.documents import StrictModel
 from app.services.decodes.context import DecodeKind
 from app.services.markers.searches import checked_box
@@ -34,8 +35,8 @@ from app.services.reprocessing import (
 # === /v1/reprocessings: stored uploads are decoded again, and what changed is reported before it becomes current.
 
 
-router = APIRouter(prefix="/v1/reprocessings", tags=["reprocessing"], route_class=StrictRoute)
-decode_versions = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
+router = Router("/v1/reprocessings", "reprocessing")
+decode_versions = Router("/v1/decodes", "decodes")
 
 ReprocessingId = Annotated[Identifier, Path(description="Id of the reprocessing.")]
 Service = Annotated[Reprocessings, use_case(lambda cases: cases.reprocessings)]
@@ -69,6 +70,7 @@ class ReprocessingIn(StrictModel):
 
 @router.post(
     "",
+    ADMINS,
     status_code=202,
     responses=document_response(ReprocessingDocument, status=202, description="Queued; Location leads to its progress"),
 )
@@ -84,7 +86,7 @@ def post_reprocessing(wanted: ReprocessingIn, caller: Caller, reprocessings: Ser
     )
 
 
-@router.get("", responses=document_response(ReprocessingPage))
+@router.get("", ADMINS, responses=document_response(ReprocessingPage))
 def list_reprocessings(
     request: Request, caller: Caller, reprocessings: Service, limit: PageSize = 100, after: LastId = None
 ) -> Response:
@@ -96,7 +98,7 @@ def list_reprocessings(
     return page_response(request, page, after=last)
 
 
-@router.get("/{reprocessing_id}", responses=document_response(ReprocessingDocument, 404))
+@router.get("/{reprocessing_id}", ADMINS, responses=document_response(ReprocessingDocument, 404))
 def get_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
     """Get a reprocessing.
 
@@ -105,7 +107,7 @@ def get_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessi
     return json_response(reprocessings.get(caller, reprocessing_id))
 
 
-@router.get("/{reprocessing_id}/report", responses=document_response(ReprocessingReport, 404))
+@router.get("/{reprocessing_id}/report", ADMINS, responses=document_response(ReprocessingReport, 404))
 def get_reprocessing_report(
     request: Request,
     reprocessing_id: ReprocessingId,
@@ -124,6 +126,7 @@ def get_reprocessing_report(
 
 @router.get(
     "/{reprocessing_id}/report.csv",
+    ADMINS,
     response_class=StreamingResponse,
     responses={**file_response(["text/csv"]), **problem_responses(404)},
 )
@@ -134,7 +137,7 @@ def get_reprocessing_csv(reprocessing_id: ReprocessingId, caller: Caller, reproc
     return StreamingResponse(lines, headers=headers, media_type="text/csv; charset=utf-8")
 
 
-@router.post("/{reprocessing_id}/cancel", responses=document_response(ReprocessingDocument, 404))
+@router.post("/{reprocessing_id}/cancel", ADMINS, responses=document_response(ReprocessingDocument, 404))
 def cancel_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
     """Cancel a reprocessing.
 
@@ -143,7 +146,7 @@ def cancel_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reproce
     return json_response(reprocessings.cancel(caller, reprocessing_id))
 
 
-@router.post("/{reprocessing_id}/accept", responses=document_response(ReprocessingDocument, 404, 409))
+@router.post("/{reprocessing_id}/accept", ADMINS, responses=document_response(ReprocessingDocument, 404, 409))
 def accept_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
     """Accept the results of a reprocessing.
 
@@ -152,7 +155,7 @@ def accept_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reproce
     return json_response(reprocessings.accept(caller, reprocessing_id))
 
 
-@decode_versions.get("/{decode_id}/versions", responses=document_response(DecodeVersions, 404))
+@decode_versions.get("/{decode_id}/versions", EVERYBODY, responses=document_response(DecodeVersions, 404))
 def list_decode_versions(
     decode_id: Annotated[Identifier, Path(description="Id of the decode.")], caller: Caller, reprocessings: Service
 ) -> Response:

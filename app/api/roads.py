@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.dependencies import (
@@ -20,6 +20,7 @@ from app.api.http.dependencies import (
     Version,
     use_case,
 )
+from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -31,7 +32,8 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
-from app.api.http.strict_json import AnyLine, StrictRoute
+from app.api.http.routes import Router
+from app.api.http.strict_json import AnyLine
 from app.errors import InvalidParameter
 from app.families.documents import Metres, StrictModel
 from app.services.markers.markers import MarkerPage
@@ -173,7 +175,7 @@ class ReferencesIn(StrictModel):
 # === /v1/roads: axes with measures; positions to measures and offsets, and back.
 
 
-router = APIRouter(prefix="/v1/roads", tags=["roads"], route_class=StrictRoute)
+router = Router("/v1/roads", "roads")
 
 _MetresQuery = Annotated[float | None, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
 _OfVersion = Annotated[
@@ -184,6 +186,8 @@ Roads = Annotated[RoadsService, use_case(lambda cases: cases.roads)]
 
 @router.post(
     "",
+    PLANNERS,
+    expensive=True,
     status_code=201,
     responses={
         200: {"model": ChangedRoad, "description": "Checked; nothing was stored"},
@@ -208,7 +212,7 @@ def post_road(road: RoadIn, caller: Caller, roads: Roads, idempotency: Idempoten
     return json_response(document) if road.dry_run else created_response(document, replayed, path="/v1/roads")
 
 
-@router.get("", responses=document_response(RoadPage))
+@router.get("", READERS, responses=document_response(RoadPage))
 def list_roads(
     request: Request,
     caller: Caller,
@@ -225,7 +229,7 @@ def list_roads(
     return page_response(request, page, after=last)
 
 
-@router.get("/{road_id}", responses={**NOT_MODIFIED, **document_response(RoadDocument, 404)})
+@router.get("/{road_id}", READERS, responses={**NOT_MODIFIED, **document_response(RoadDocument, 404)})
 def get_road(road_id: RoadId, caller: Caller, roads: Roads, if_none_match: IfNoneMatch = None) -> Response:
     """Get a road.
 
@@ -234,7 +238,7 @@ def get_road(road_id: RoadId, caller: Caller, roads: Roads, if_none_match: IfNon
     return versioned_response(roads.get(caller, road_id), if_none_match)
 
 
-@router.patch("/{road_id}", responses=document_response(ChangedRoad, 404, 412, 428))
+@router.patch("/{road_id}", PLANNERS, expensive=True, responses=document_response(ChangedRoad, 404, 412, 428))
 def patch_road(road_id: RoadId, patch: RoadPatch, caller: Caller, roads: Roads, version: Version) -> Response:
     """Change a road's axis or calibration.
 
@@ -258,7 +262,7 @@ def patch_road(road_id: RoadId, patch: RoadPatch, caller: Caller, roads: Roads, 
     return json_response(document) if patch.dry_run else versioned_response(document)
 
 
-@router.get("/{road_id}/versions", responses=document_response(RoadVersionPage, 404))
+@router.get("/{road_id}/versions", READERS, responses=document_response(RoadVersionPage, 404))
 def list_road_versions(
     road_id: RoadId,
     request: Request,
@@ -275,7 +279,7 @@ def list_road_versions(
     return page_response(request, page, after=last)
 
 
-@router.get("/{road_id}/locate", responses=document_response(RoadLocated, 404))
+@router.get("/{road_id}/locate", READERS, responses=document_response(RoadLocated, 404))
 def locate_on_road(
     road_id: RoadId,
     caller: Caller,
@@ -293,7 +297,7 @@ def locate_on_road(
     return json_response(RoadLocated(**_of(many), **many["items"][0]))
 
 
-@router.post("/{road_id}/locate", responses=document_response(RoadLocatedMany, 404))
+@router.post("/{road_id}/locate", READERS, expensive=True, responses=document_response(RoadLocatedMany, 404))
 def locate_many_on_road(
     road_id: RoadId, body: PositionsIn, caller: Caller, roads: Roads, version: _OfVersion = None
 ) -> Response:
@@ -305,7 +309,7 @@ def locate_many_on_road(
     return json_response(roads.locate(caller, road_id, positions, body.max_offset_m, version))
 
 
-@router.get("/{road_id}/position", responses=document_response(RoadPlaced, 404))
+@router.get("/{road_id}/position", READERS, responses=document_response(RoadPlaced, 404))
 def get_position_on_road(
     road_id: RoadId,
     caller: Caller,
@@ -331,7 +335,7 @@ def get_position_on_road(
     return json_response(document)
 
 
-@router.post("/{road_id}/position", responses=document_response(RoadPlacedMany, 404))
+@router.post("/{road_id}/position", READERS, expensive=True, responses=document_response(RoadPlacedMany, 404))
 def get_positions_on_road(
     road_id: RoadId, body: ReferencesIn, caller: Caller, roads: Roads, version: _OfVersion = None
 ) -> Response:
@@ -343,7 +347,7 @@ def get_positions_on_road(
     return json_response(roads.place(caller, road_id, references, version))
 
 
-@router.get("/{road_id}/markers", responses=document_response(MarkerPage, 404))
+@router.get("/{road_id}/markers", READERS, responses=document_response(MarkerPage, 404))
 def list_markers_on_road(
     road_id: RoadId,
     request: Request,

@@ -13,16 +13,17 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import anyio
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi import Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.decodes.schemas import ContextIn
 from app.api.decodes.uploads import context_of, with_vehicle
 from app.api.http.bodies import append, finish, media_type_of, read_declaration, spool_of
 from app.api.http.dependencies import Caller, Identifier, use_case
+from app.api.http.permissions import UPLOADERS
 from app.api.http.problems import BodyRefused, Described, problem_responses, reference
 from app.api.http.responses import BINARY, document_response, json_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.errors import (
     MalformedRequest,
     UnsupportedUpload,
@@ -263,7 +264,7 @@ def _blocks(file: SpooledFile) -> Iterator[bytes]:
 # === /v1/uploads.
 
 
-router = APIRouter(prefix="/v1/uploads", tags=["uploads"], route_class=StrictRoute)
+router = Router("/v1/uploads", "uploads")
 
 Service = Annotated[UploadsService, use_case(lambda cases: cases.uploads)]
 UploadId = Annotated[Identifier, Path(description="Id of the upload.")]
@@ -338,6 +339,7 @@ async def _started(request: Request, caller: Caller, uploads: Service) -> Upload
 
 @router.post(
     "",
+    UPLOADERS,
     status_code=201,
     openapi_extra=_body(required=False, **{"application/json": {"schema": reference(PartsIn)}}),
     responses={
@@ -356,7 +358,7 @@ async def post_upload(response: Annotated[Response, Depends(_created)]) -> Respo
     return response
 
 
-@router.post("/{upload_id}/complete", responses=document_response(UploadDocument, 404, 409, 410, 423))
+@router.post("/{upload_id}/complete", UPLOADERS, responses=document_response(UploadDocument, 404, 409, 410, 423))
 def complete_upload(upload_id: UploadId, caller: Caller, uploads: Service, body: CompleteIn) -> Response:
     """Complete an upload whose parts were sent to S3.
 
@@ -365,7 +367,7 @@ def complete_upload(upload_id: UploadId, caller: Caller, uploads: Service, body:
     return json_response(uploads.complete_parts(caller, upload_id, body.etags))
 
 
-@router.get("/{upload_id}", responses=document_response(UploadDocument, 404, 410))
+@router.get("/{upload_id}", UPLOADERS, responses=document_response(UploadDocument, 404, 410))
 def get_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
     """Get an upload.
 
@@ -377,6 +379,7 @@ def get_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Respons
 
 @router.head(
     "/{upload_id}",
+    UPLOADERS,
     responses={200: {"description": "Upload-Offset is the number of bytes stored"}, **problem_responses(404, 410, 412)},
 )
 def head_upload(request: Request, upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
@@ -411,6 +414,7 @@ async def _patched(request: Request, upload_id: UploadId, caller: Caller, upload
 
 @router.patch(
     "/{upload_id}",
+    UPLOADERS,
     status_code=204,
     openapi_extra=_body(required=True),
     responses={
@@ -426,7 +430,9 @@ async def patch_upload(headers: Annotated[dict[str, str], Depends(_patched)]) ->
     return Response(status_code=204, headers=headers)
 
 
-@router.delete("/{upload_id}", status_code=204, responses={**_NO_CONTENT, **problem_responses(404, 410, 412, 423)})
+@router.delete(
+    "/{upload_id}", UPLOADERS, status_code=204, responses={**_NO_CONTENT, **problem_responses(404, 410, 412, 423)}
+)
 def delete_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
     """Give an upload up.
 
@@ -436,13 +442,13 @@ def delete_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Resp
     return Response(status_code=204, headers={"Tus-Resumable": "1.0.0"})
 
 
-@router.options("", responses={**_OPTIONS, **problem_responses()})
+@router.options("", UPLOADERS, responses={**_OPTIONS, **problem_responses()})
 async def list_options(uploads: Service) -> Response:
     """List the version, extensions and limits of tus."""
     return Response(headers=options(uploads.rules.max_bytes))
 
 
-@router.options("/{upload_id}", responses={**_OPTIONS, **problem_responses()})
+@router.options("/{upload_id}", UPLOADERS, responses={**_OPTIONS, **problem_responses()})
 async def list_upload_options(upload_id: UploadId, uploads: Service) -> Response:
     """List the version, extensions and limits of tus for an upload.
 

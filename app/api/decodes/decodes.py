@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 
 from app.api.decodes.schemas import CONTEXT_EXAMPLE, ContextIn
 from app.api.decodes.uploads import RAW_TYPES, Upload
 from app.api.http.bodies import form_body
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
+from app.api.http.permissions import EVERYBODY, UPLOADERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -22,7 +23,7 @@ from app.api.http.responses import (
     json_response,
     page_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
@@ -32,7 +33,7 @@ from app.services.decodes.documents import DecodeDocument, DecodePage
 from app.services.decodes.outputs import DecodeOutputs
 from app.services.decodes.trace_tasks import MAX_POINTS, MAX_SERIES, SamplesDocument
 
-router = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
+router = Router("/v1/decodes", "decodes")
 
 DecodeId = Annotated[Identifier, Path(description="Id of the decode.")]
 _MEDIA_TYPES = {"png": "image/png", "jpg": "image/jpeg"}
@@ -54,6 +55,7 @@ Outputs = Annotated[DecodeOutputs, use_case(lambda cases: cases.decode_outputs)]
 
 @router.post(
     "",
+    UPLOADERS,
     status_code=201,
     openapi_extra=_BODY,
     responses={
@@ -84,7 +86,7 @@ def post_decode(caller: Caller, upload: Upload, decodes: Decodes) -> Response:
     return response
 
 
-@router.get("", responses=document_response(DecodePage))
+@router.get("", EVERYBODY, responses=document_response(DecodePage))
 def list_decodes(
     request: Request,
     caller: Caller,
@@ -106,7 +108,7 @@ def list_decodes(
     return page_response(request, {"items": page}, after=last)
 
 
-@router.get("/{decode_id}", responses=document_response(DecodeDocument, 404))
+@router.get("/{decode_id}", EVERYBODY, responses=document_response(DecodeDocument, 404))
 def get_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
     """Get a decode.
 
@@ -117,7 +119,7 @@ def get_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Respons
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-@router.post("/{decode_id}/cancel", responses=document_response(DecodeDocument, 404))
+@router.post("/{decode_id}/cancel", UPLOADERS, responses=document_response(DecodeDocument, 404))
 def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
     """Cancel a decode.
 
@@ -127,7 +129,9 @@ def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Resp
 
 
 @router.get(
-    "/{decode_id}/plot.svg", responses={**file_response(["image/svg+xml"]), **NOT_MODIFIED, **problem_responses(404)}
+    "/{decode_id}/plot.svg",
+    EVERYBODY,
+    responses={**file_response(["image/svg+xml"]), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_plot(decode_id: DecodeId, caller: Caller, outputs: Outputs, if_none_match: IfNoneMatch = None) -> Response:
     """Get the plot of a decode.
@@ -142,7 +146,9 @@ def get_plot(decode_id: DecodeId, caller: Caller, outputs: Outputs, if_none_matc
 
 
 @router.get(
-    "/{decode_id}/lane.geojson", responses={**file_response(["application/geo+json"]), **problem_responses(404)}
+    "/{decode_id}/lane.geojson",
+    EVERYBODY,
+    responses={**file_response(["application/geo+json"]), **problem_responses(404)},
 )
 def get_lane(decode_id: DecodeId, caller: Caller, outputs: Outputs) -> Response:
     """Get the lane that a packet log gave.
@@ -156,6 +162,7 @@ def get_lane(decode_id: DecodeId, caller: Caller, outputs: Outputs) -> Response:
 
 @router.get(
     "/{decode_id}/overlay.{form}",
+    EVERYBODY,
     responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_overlay(
@@ -179,6 +186,7 @@ def get_overlay(
 
 @router.get(
     "/{decode_id}/annotated.{form}",
+    EVERYBODY,
     responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
 )
 def get_annotated(
@@ -209,13 +217,15 @@ def get_annotated(
 # === /v1/decodes/{decode_id}: samples, packets, the vehicle's track and lists of readings of one decode.
 
 
-detail_router = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
+detail_router = Router("/v1/decodes", "decodes")
 
 Details = Annotated[DecodeDetails, use_case(lambda cases: cases.decode_details)]
 _FILE_MEDIA_TYPES = {"geojson": "application/geo+json", "csv": "text/csv", "gpx": "application/gpx+xml"}
 
 
-@detail_router.get("/{decode_id}/samples", responses=document_response(SamplesDocument, 404, 422))
+@detail_router.get(
+    "/{decode_id}/samples", EVERYBODY, expensive=True, responses=document_response(SamplesDocument, 404, 422)
+)
 def get_samples(
     decode_id: DecodeId,
     caller: Caller,
@@ -238,7 +248,7 @@ def get_samples(
     return json_response(document)
 
 
-@detail_router.get("/{decode_id}/packets", responses=document_response(PacketsDocument, 404))
+@detail_router.get("/{decode_id}/packets", EVERYBODY, expensive=True, responses=document_response(PacketsDocument, 404))
 def get_packets(decode_id: DecodeId, caller: Caller, details: Details) -> Response:
     """Get the packets of a log.
 
@@ -248,7 +258,9 @@ def get_packets(decode_id: DecodeId, caller: Caller, details: Details) -> Respon
 
 
 @detail_router.get(
-    "/{decode_id}/track.{form}", responses={**file_response(_FILE_MEDIA_TYPES.values()), **problem_responses(404)}
+    "/{decode_id}/track.{form}",
+    EVERYBODY,
+    responses={**file_response(_FILE_MEDIA_TYPES.values()), **problem_responses(404)},
 )
 def get_decode_track(
     decode_id: DecodeId, form: Literal["geojson", "csv", "gpx"], caller: Caller, details: Details
@@ -264,6 +276,7 @@ def get_decode_track(
 
 @detail_router.get(
     "/{decode_id}/readings.{form}",
+    EVERYBODY,
     responses={**file_response([_FILE_MEDIA_TYPES[form] for form in ("geojson", "csv")]), **problem_responses(404)},
 )
 def get_readings(decode_id: DecodeId, form: Literal["geojson", "csv"], caller: Caller, details: Details) -> Response:

@@ -153,42 +153,6 @@ def address_of(host: str) -> str:
 # === The cost of requests: a budget of processor time by key and agency, and slots for routes that may take seconds.
 
 
-EXPENSIVE = frozenset(
-    {
-        "POST /v1/markers/bulk",
-        "POST /v1/markers/search",
-        "POST /v1/artwork",
-        "POST /v1/programs",
-        "POST /v1/radio-checks",
-        "POST /v1/imports",
-        "GET /v1/exports/{kind}",
-        "GET /v1/snapshots",
-        "POST /v1/alignments",
-        "GET /v1/alignments/{alignment_id}/map.{form}",
-        "GET /v1/alignments/{alignment_id}/profile",
-        "POST /v1/plan-rules",
-        "POST /v1/plan-previews",
-        "POST /v1/plans",
-        "PATCH /v1/plans/{plan_id}",
-        "GET /v1/plans/{plan_id}/files/{name}",
-        "POST /v1/plans/{plan_id}/commit",
-        "GET /v1/plans/{plan_id}/as-built",
-        "POST /v1/roads",
-        "PATCH /v1/roads/{road_id}",
-        "POST /v1/roads/{road_id}/locate",
-        "POST /v1/roads/{road_id}/position",
-        "POST /v1/codebooks",
-        "POST /v1/codebook-drafts",
-        "POST /v1/codebooks/{codebook_id}/entries",
-        "POST /v1/calibrations",
-        "POST /v1/plate-drafts/artwork.{form}",
-        "POST /v1/plate-drafts/view",
-        "POST /v1/print-grades",
-        "GET /v1/decodes/{decode_id}/samples",
-        "GET /v1/decodes/{decode_id}/packets",
-    }
-)
-"""Routes whose largest request takes over a second. Source: `python -m benchmarks.abuse`."""
 MAX_WAITING = 16
 """Expensive requests of one agency that wait for a slot; each holds its body."""
 SLOT_WAIT_S = 20.0

@@ -4,27 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import difflib
-import inspect
-from collections.abc import Callable, Collection, Coroutine
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from functools import cache, partial
-from threading import RLock
+from functools import cache
 from typing import Annotated, Any, Literal, TypeVar
 
-from fastapi import Depends, Request, Response
-from fastapi.datastructures import DefaultPlaceholder
 from fastapi.exceptions import RequestValidationError
-from fastapi.routing import APIRoute
 from pydantic import BaseModel, ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
-from starlette.routing import compile_path, get_name
 
-from app.api.http.dependencies import Number, refuse_unknown_parameters
-from app.api.http.limits import EXPENSIVE, bounded
-from app.api.http.openapi import operation_id
-from app.api.http.problems import with_reference
-from app.errors import UnsupportedUpload
+from app.api.http.dependencies import Number
 from app.formats.json_text import parse_json
 from app.services.request_work import counted
 
@@ -38,88 +28,6 @@ _READER = ThreadPoolExecutor(1, "json")
 """Reading holds the interpreter's lock, so a second thread would only delay the event loop further."""
 _MAX_LISTED = 10_000
 """Errors that are listed. Source: by measurement, listing more keeps the interpreter's lock for over 20 ms."""
-_BUILD = RLock()
-
-
-class StrictRoute(APIRoute):
-    """A route whose endpoint is `bounded`, and whose JSON body goes through `parse_json`: a large one in a thread.
-
-    Routes below /v1 refuse query parameters that they do not know. A route is built, its dependencies analysed and the
-    models of its body compiled, when it is first used: by a request, or when the OpenAPI document is made. All routes
-    together take a fifth of the time of a start. The schemas of its responses are made for the OpenAPI document only.
-    The first line of the endpoint's docstring is the summary of the operation, the rest its description.
-    """
-
-    def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
-        self._declared: tuple[Callable[..., Any], dict[str, Any]] | None = (endpoint, options)
-        self.path, self.endpoint = path, endpoint
-        self.name = options.get("name") or get_name(endpoint)
-        self.methods = {method.upper() for method in options.get("methods") or ("GET",)}
-        self.path_regex, self.path_format, self.param_convertors = compile_path(path)
-
-    def __getattr__(self, name: str) -> Any:
-        """Build the route: this is called for attributes that it does not have yet."""
-        with _BUILD:
-            declared = self.__dict__.get("_declared")
-            if declared is not None:
-                self._declared = None
-                self._build(*declared)
-        if name not in self.__dict__:
-            raise AttributeError(f"a route has no {name}")
-        return self.__dict__[name]
-
-    def _build(self, endpoint: Callable[..., Any], options: dict[str, Any]) -> None:
-        methods = self.methods or set()
-        expensive = any(f"{method} {self.path}" in EXPENSIVE for method in methods)
-        described = {status: with_reference(response) for status, response in (options["responses"] or {}).items()}
-        refused = [Depends(refuse_unknown_parameters)] if self.path.startswith("/v1/") else []
-        shown = options["response_class"]
-        own: dict[str, Any] = {
-            "responses": described,
-            "dependencies": [*refused, *(options["dependencies"] or ())],
-            "generate_unique_id_function": operation_id,
-            "response_class": Response if isinstance(shown, DefaultPlaceholder) else shown,
-        }
-        run = bounded(endpoint, expensive=expensive, watched=expensive or methods <= {"GET", "HEAD"})
-        super().__init__(self.path, run, **options | own)
-        self.summary, self.description = _texts_of(endpoint)
-
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """Handle the request with a strict reader of its body."""
-        handler = super().get_route_handler()
-        if self.body_field is None:
-            return handler
-        model = self.body_field.field_info.annotation
-        assert model is not None
-        read = partial(_read_body, TypeAdapter(model))
-
-        async def handle(request: Request) -> Response:
-            body = await request.body()
-            if body:
-                _check_media_type(request)
-                # FastAPI takes what is there for the parsed body, and a valid model for a valid body
-                request._json = await in_thread_if_large(len(body), partial(read, body))
-            return await handler(request)
-
-        return handle
-
-
-def _texts_of(endpoint: Callable[..., object]) -> tuple[str, str]:
-    """Summary and description of an operation, from the docstring of its endpoint."""
-    summary, _, description = (inspect.getdoc(endpoint) or "").partition("\n")
-    return summary.removesuffix("."), description.strip()
-
-
-def _check_media_type(request: Request) -> None:
-    sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    kind, _, subtype = sent.partition("/")
-    if kind != "application" or not (subtype == "json" or subtype.endswith("+json")):
-        raise UnsupportedUpload(
-            f"the body is JSON, but its Content-Type is {sent[:80] or 'missing'}",
-            field="Content-Type",
-            limit="application/json",
-            cure="send the header Content-Type: application/json",
-        )
 
 
 async def in_thread_if_large(size_bytes: int, read: Callable[[], T]) -> T:
@@ -130,7 +38,8 @@ async def in_thread_if_large(size_bytes: int, read: Callable[[], T]) -> T:
     return await asyncio.get_running_loop().run_in_executor(_READER, lambda: context.run(counted, read))
 
 
-def _read_body(body: TypeAdapter[Any], raw: bytes) -> Any:
+def read_body(body: TypeAdapter[Any], raw: bytes) -> Any:
+    """A JSON body as a model; errors as of `parse_json` and `validated`."""
     return validated(body, parse_json(raw), "body")
 
 

@@ -10,18 +10,19 @@ from typing import Annotated, Literal
 import anyio
 import structlog
 from anyio import to_thread
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import Field
 from typing_extensions import TypedDict
 
 from app.api.http.dependencies import Caller
+from app.api.http.permissions import ADMINS, PUBLIC
 from app.api.http.responses import document_response, json_response, text_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.errors import WaymarkError
 from app.services.decodes.upload_path import written_metrics
 
-router = APIRouter(tags=["system"], route_class=StrictRoute)
+router = Router("", "system")
 _LOG = structlog.get_logger("waymark")
 _VALID_S = 2.0
 """How long a result of the checks is valid: clients without a key may ask as often as they like. [s]"""
@@ -91,7 +92,7 @@ async def _fault_of(check: Callable[[], str | None]) -> str | None:
         return f"{error.message}: {error.__cause__}" if error.__cause__ is not None else error.message
 
 
-@router.get("/healthz", responses={200: {"model": ProcessHealth}})
+@router.get("/healthz", PUBLIC, responses={200: {"model": ProcessHealth}})
 async def get_health() -> Response:
     """Check whether the process responds."""
     return json_response(ProcessHealth(status="ok"))
@@ -99,6 +100,7 @@ async def get_health() -> Response:
 
 @router.get(
     "/readyz",
+    PUBLIC,
     responses={
         200: {"model": ReadinessDocument},
         503: {"model": ReadinessDocument, "description": "A part is not ready"},
@@ -116,7 +118,7 @@ async def get_readiness(request: Request) -> Response:
     return json_response(document, 200 if ready else 503)
 
 
-@router.get("/metrics", responses=text_response("text/plain", "Prometheus text format"))
+@router.get("/metrics", PUBLIC, responses=text_response("text/plain", "Prometheus text format"))
 def get_metrics(request: Request) -> Response:
     """Get the server's metrics.
 
@@ -128,7 +130,7 @@ def get_metrics(request: Request) -> Response:
 # === GET /v1/page-settings: what the web pages need to know before anybody has signed in.
 
 
-page_settings_router = APIRouter(prefix="/v1/page-settings", tags=["system"], route_class=StrictRoute)
+page_settings_router = Router("/v1/page-settings", "system")
 
 
 class SignInOptions(TypedDict):
@@ -158,7 +160,7 @@ class PageSettings(TypedDict):
     guide: Annotated[bool, Field(description="The documents are at /guide: false where they were not built.")]
 
 
-@page_settings_router.get("", responses=document_response(PageSettings))
+@page_settings_router.get("", PUBLIC, responses=document_response(PageSettings))
 async def get_page_settings(request: Request) -> Response:
     """Get the settings of the web pages.
 
@@ -170,7 +172,7 @@ async def get_page_settings(request: Request) -> Response:
 # === GET /v1/server-settings: what the server runs with, for admins: no secret, no path, no address of a store.
 
 
-server_settings_router = APIRouter(prefix="/v1/server-settings", tags=["system"], route_class=StrictRoute)
+server_settings_router = Router("/v1/server-settings", "system")
 
 
 class NumberSetting(TypedDict):
@@ -200,7 +202,7 @@ class ServerSettings(TypedDict):
     numbers: Annotated[list[NumberSetting], Field(description="Limits and switches, see docs/settings.md.")]
 
 
-@server_settings_router.get("", responses=document_response(ServerSettings))
+@server_settings_router.get("", ADMINS, responses=document_response(ServerSettings))
 async def get_server_settings(request: Request, caller: Caller) -> Response:
     """Get the settings that the server runs with."""
     return json_response(request.app.state.server_settings)

@@ -12,7 +12,7 @@ from gzip import compress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from fastapi import APIRouter, FastAPI, Request
+from fastapi import FastAPI, Request
 from fastapi import Response as FastapiResponse
 from fastapi.responses import FileResponse as ResponsesFileResponse
 from starlette.datastructures import Headers, MutableHeaders
@@ -23,7 +23,8 @@ from starlette.types import Message, Receive, Scope, Send
 from app import shipped_folder
 from app.api.http.openapi import STORED
 from app.api.http.page_addresses import PAGES
-from app.api.http.strict_json import StrictRoute
+from app.api.http.permissions import PUBLIC
+from app.api.http.routes import Router
 from app.errors import NotFound
 
 # === What browsers may do on our pages: the Content-Security-Policy, which allows nothing that is not named here.
@@ -205,7 +206,7 @@ _REDOC_STYLES = (
 )
 """Hashes of the two style elements that Redoc makes: an empty one, which its script fills, and that of its menu."""
 
-router = APIRouter(route_class=StrictRoute)
+router = Router("")
 
 
 def page_headers(policy: str) -> dict[str, str]:
@@ -228,16 +229,16 @@ def get_page(request: Request) -> FastapiResponse:
 
 
 for _path in PAGES:
-    router.add_api_route(_path, get_page, response_class=ResponsesFileResponse, include_in_schema=False)
+    router.get(_path, PUBLIC, response_class=ResponsesFileResponse, include_in_schema=False)(get_page)
 
 
-@router.get("/docs", response_class=ResponsesFileResponse, include_in_schema=False)
+@router.get("/docs", PUBLIC, response_class=ResponsesFileResponse, include_in_schema=False)
 def get_docs() -> ResponsesFileResponse:
     """The API's documentation by Swagger UI, from static/vendor."""
     return ResponsesFileResponse(STATIC / "docs.html", headers=page_headers(content_security_policy()))
 
 
-@router.get("/redoc", response_class=ResponsesFileResponse, include_in_schema=False)
+@router.get("/redoc", PUBLIC, response_class=ResponsesFileResponse, include_in_schema=False)
 def get_redoc() -> ResponsesFileResponse:
     """The API's reference by Redoc, from static/vendor."""
     return ResponsesFileResponse(
@@ -245,7 +246,8 @@ def get_redoc() -> ResponsesFileResponse:
     )
 
 
-@router.api_route("/openapi.json", methods=["GET", "HEAD"], include_in_schema=False)
+@router.get("/openapi.json", PUBLIC, include_in_schema=False)
+@router.head("/openapi.json", PUBLIC, include_in_schema=False)
 def get_openapi_document() -> FastapiResponse:
     """The stored OpenAPI document."""
     return FastapiResponse(_openapi_document(), media_type="application/json", headers={"Cache-Control": "no-cache"})

@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from enum import StrEnum
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Response
+from fastapi import Query, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.dependencies import Caller, Idempotency, MarkerId, Number, use_case
+from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -22,7 +23,7 @@ from app.api.http.responses import (
     text_response,
     wants_job,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.api.jobs import queued_job
 from app.api.markers.searches import SelectionIn
 from app.encoders.cerpm import hex_dump
@@ -34,7 +35,7 @@ from app.services.markers.artwork import ArtworkJobs, Artworks, Bundle, bundle_o
 from app.services.markers.programs import CerpmPrograms, Layouts, PayloadDocument, payload_document
 from app.services.progress import JobDocument
 
-router = APIRouter(prefix="/v1", tags=["artwork"], route_class=StrictRoute)
+router = Router("/v1", "artwork")
 
 _CHUNK = 1 << 18
 Resolution = Annotated[float, Field(ge=20, le=300, allow_inf_nan=False)]
@@ -76,6 +77,7 @@ ArtworkService = Annotated[Artworks, use_case(lambda cases: cases.artworks)]
 
 @router.get(
     "/markers/{marker_id}/artwork.{form}",
+    READERS,
     responses={
         **file_response((form.media_type for form in ArtworkFormat), headers=_HEADERS),
         **NOT_MODIFIED,
@@ -115,6 +117,8 @@ def get_artwork(
 
 @router.post(
     "/artwork",
+    READERS,
+    expensive=True,
     response_class=StreamingResponse,
     responses={
         **file_response(["application/zip"], headers=_HEADERS),
@@ -162,11 +166,12 @@ def _chunks(bundle: Bundle) -> Iterator[bytes]:
 # === Layouts of magnet markers as drilling sheets.
 
 
-layout_router = APIRouter(prefix="/v1/markers", tags=["artwork"], route_class=StrictRoute)
+layout_router = Router("/v1/markers", "artwork")
 
 
 @layout_router.get(
     "/{marker_id}/layout.{form}",
+    READERS,
     responses={
         **file_response(form.media_type.partition(";")[0] for form in SheetFormat),
         **NOT_MODIFIED,
@@ -195,7 +200,7 @@ def get_layout(
 # === What CERPMs send and are programmed with.
 
 
-program_router = APIRouter(prefix="/v1", tags=["cerpms"], route_class=StrictRoute)
+program_router = Router("/v1", "cerpms")
 
 
 class PayloadFormat(StrEnum):
@@ -224,6 +229,7 @@ Programs = Annotated[CerpmPrograms, use_case(lambda cases: cases.programs)]
 
 @program_router.get(
     "/markers/{marker_id}/payload.{form}",
+    PLANNERS,  # who has a payload can speak for the marker
     responses={
         200: {
             "model": PayloadDocument,
@@ -258,7 +264,12 @@ def get_payload(
     return Response(content, headers=headers, media_type=form.media_type)
 
 
-@program_router.post("/programs", responses={**text_response("text/csv"), **problem_responses(404)})
+@program_router.post(
+    "/programs",
+    PLANNERS,  # with the markers' keys: admins, see app/services/markers/programs.py
+    expensive=True,
+    responses={**text_response("text/csv"), **problem_responses(404)},
+)
 def post_programs(wanted: ProgramsIn, caller: Caller, programs: Programs) -> Response:
     """Make a table for programming several CERPMs.
 

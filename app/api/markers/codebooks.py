@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, Text, Whole, use_case
+from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.responses import (
     NOT_MODIFIED,
     IfNoneMatch,
@@ -17,7 +18,7 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.encoders.magnet import CodebookRules
 from app.errors import InvalidParameter, naming
 from app.families.documents import Flag, StrictModel
@@ -137,13 +138,19 @@ class MeaningsIn(StrictModel):
 # === /v1/codebooks.
 
 
-router = APIRouter(prefix="/v1/codebooks", tags=["codebooks"], route_class=StrictRoute)
+router = Router("/v1/codebooks", "codebooks")
 
 CodebookId = Annotated[Identifier, Path(description="Id of the codebook.")]
 Service = Annotated[Codebooks, use_case(lambda cases: cases.codebooks)]
 
 
-@router.post("", status_code=201, responses=document_response(CodebookDocument, 409, status=201, description="Made"))
+@router.post(
+    "",
+    PLANNERS,
+    expensive=True,
+    status_code=201,
+    responses=document_response(CodebookDocument, 409, status=201, description="Made"),
+)
 def post_codebook(wanted: CodebookIn, caller: Caller, codebooks: Service, idempotency: Idempotency) -> Response:
     """Make a codebook.
 
@@ -156,7 +163,7 @@ def post_codebook(wanted: CodebookIn, caller: Caller, codebooks: Service, idempo
     return created_response(document, replayed, path="/v1/codebooks")
 
 
-@router.get("", responses=document_response(CodebookPage))
+@router.get("", READERS, responses=document_response(CodebookPage))
 def list_codebooks(
     request: Request,
     caller: Caller,
@@ -172,7 +179,7 @@ def list_codebooks(
     return page_response(request, page, after=last)
 
 
-@router.get("/{codebook_id}", responses={**NOT_MODIFIED, **document_response(CodebookDocument, 404)})
+@router.get("/{codebook_id}", READERS, responses={**NOT_MODIFIED, **document_response(CodebookDocument, 404)})
 def get_codebook(
     codebook_id: CodebookId, caller: Caller, codebooks: Service, if_none_match: IfNoneMatch = None
 ) -> Response:
@@ -185,6 +192,8 @@ def get_codebook(
 
 @router.post(
     "/{codebook_id}/entries",
+    PLANNERS,
+    expensive=True,
     status_code=201,
     responses=document_response(CodebookDocument, 404, 409, status=201, description="Added"),
 )
@@ -200,7 +209,7 @@ def post_entries(
     return created_response(document, replayed)
 
 
-@router.get("/{codebook_id}/entries", responses=document_response(EntryList, 404))
+@router.get("/{codebook_id}/entries", READERS, responses=document_response(EntryList, 404))
 def list_entries(
     codebook_id: CodebookId,
     caller: Caller,
@@ -215,7 +224,7 @@ def list_entries(
     return json_response(codebooks.list_entries(caller, codebook_id, _meaning(kind, value)))
 
 
-@router.get("/{codebook_id}/entries/{code}", responses=document_response(EntryDocument, 404))
+@router.get("/{codebook_id}/entries/{code}", READERS, responses=document_response(EntryDocument, 404))
 def get_entry(
     codebook_id: CodebookId,
     code: Annotated[Text, Path(max_length=64, examples=["SNS_4_0.1_10-30"])],
@@ -245,10 +254,10 @@ def _meaning(kind: str | None, value: str | None) -> tuple[str, float | str] | N
 # === /v1/codebook-drafts: the capacity of a codebook before it is made. Nothing is stored.
 
 
-draft_router = APIRouter(prefix="/v1/codebook-drafts", tags=["codebooks"], route_class=StrictRoute)
+draft_router = Router("/v1/codebook-drafts", "codebooks")
 
 
-@draft_router.post("", responses=document_response(CodebookDraftDocument))
+@draft_router.post("", READERS, expensive=True, responses=document_response(CodebookDraftDocument))
 def post_codebook_draft(wanted: CodebookDraftIn, caller: Caller) -> Response:
     """Count the codes of a design of a codebook.
 

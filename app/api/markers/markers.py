@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import (
     BaseModel,
@@ -32,7 +32,7 @@ from app.api.http.dependencies import (
     Version,
     use_case,
 )
-from app.api.http.permissions import PERMISSIONS
+from app.api.http.permissions import PLANNERS, READERS, SURVEYORS
 from app.api.http.problems import (
     UNION_TAG,
     Described,
@@ -53,7 +53,8 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
-from app.api.http.strict_json import StrictRoute, validated
+from app.api.http.routes import Router
+from app.api.http.strict_json import validated
 from app.errors import InvalidParameter, WaymarkError
 from app.families import FAMILIES, FAMILY_NAMES, union_of
 from app.families.documents import POSITION_EXAMPLE, Headed, MarkerIn, PositionIn, StrictModel
@@ -125,7 +126,7 @@ class MarkerPatch(Headed, _FamilyChanges):
 # === /v1/markers: register, list, read and change markers.
 
 
-router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
+router = Router("/v1/markers", "markers")
 
 _DEFAULT_FAMILY = FAMILY_NAMES[0]
 WARNINGS_TEXT = "What a warning about a position means: the marker is stored, or refused with 422."
@@ -166,7 +167,10 @@ class NewMarkerIn(RootModel[_AnyMarkerIn]):
 
 
 @router.post(
-    "", status_code=201, responses=document_response(AnyMarkerDetail, 404, 409, status=201, description="Registered")
+    "",
+    PLANNERS,
+    status_code=201,
+    responses=document_response(AnyMarkerDetail, 404, 409, status=201, description="Registered"),
 )
 def post_marker(
     marker: NewMarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency, warnings: Warnings = "store"
@@ -186,7 +190,9 @@ _PUBLIC_PAGE: Described = {
 }
 
 
-@router.get("/{marker_id}", responses={**_PUBLIC_PAGE, **NOT_MODIFIED, **document_response(AnyMarkerDetail, 404)})
+@router.get(
+    "/{marker_id}", READERS, responses={**_PUBLIC_PAGE, **NOT_MODIFIED, **document_response(AnyMarkerDetail, 404)}
+)
 def get_marker(marker_id: MarkerId, caller: Caller, markers: Markers, if_none_match: IfNoneMatch = None) -> Response:
     """Get a marker.
 
@@ -195,7 +201,7 @@ def get_marker(marker_id: MarkerId, caller: Caller, markers: Markers, if_none_ma
     return versioned_response(markers.get(caller, marker_id), if_none_match)
 
 
-@router.patch("/{marker_id}", responses=document_response(AnyMarkerDetail, 404, 409, 412, 428))
+@router.patch("/{marker_id}", SURVEYORS, responses=document_response(AnyMarkerDetail, 404, 409, 412, 428))
 def patch_marker(
     marker_id: MarkerId,
     patch: MarkerPatch,
@@ -211,7 +217,7 @@ def patch_marker(
     return versioned_response(markers.change(caller, marker_id, patch.change(), version, warnings))
 
 
-@router.get("/{marker_id}/accuracy", responses=document_response(AccuracyDocument, 404))
+@router.get("/{marker_id}/accuracy", READERS, responses=document_response(AccuracyDocument, 404))
 def get_marker_accuracy(marker_id: MarkerId, caller: Caller, markers: Markers) -> Response:
     """Get the accuracy of a marker's survey.
 
@@ -220,7 +226,7 @@ def get_marker_accuracy(marker_id: MarkerId, caller: Caller, markers: Markers) -
     return json_response(markers.accuracy(caller, marker_id))
 
 
-@router.get("/{marker_id}/versions", responses=document_response(VersionPage, 404))
+@router.get("/{marker_id}/versions", READERS, responses=document_response(VersionPage, 404))
 def list_marker_versions(
     marker_id: MarkerId,
     request: Request,
@@ -237,7 +243,7 @@ def list_marker_versions(
     return page_response(request, {"items": page}, after=last)
 
 
-@router.get("/{marker_id}/versions/{version}", responses=document_response(VersionDocument, 404))
+@router.get("/{marker_id}/versions/{version}", READERS, responses=document_response(VersionDocument, 404))
 def get_marker_version(
     marker_id: MarkerId,
     version: Annotated[int, Path(ge=1, lt=2**31, description="Number of the version, 1 for the first.")],
@@ -251,13 +257,13 @@ def get_marker_version(
 # === /v1/markers/{marker_id}/observations: what vehicles saw of a marker.
 
 
-observation_router = APIRouter(prefix="/v1/markers/{marker_id}/observations", tags=["markers"], route_class=StrictRoute)
+observation_router = Router("/v1/markers/{marker_id}/observations", "markers")
 
 
 Observations = Annotated[ObservationsService, use_case(lambda cases: cases.observations)]
 
 
-@observation_router.get("", responses=document_response(ObservationPage, 404))
+@observation_router.get("", READERS, responses=document_response(ObservationPage, 404))
 def list_marker_observations(
     marker_id: MarkerId,
     request: Request,
@@ -288,7 +294,7 @@ def list_marker_observations(
     return page_response(request, page, after=last)
 
 
-@observation_router.get("/summary", responses=document_response(ObservationSummary, 404))
+@observation_router.get("/summary", READERS, responses=document_response(ObservationSummary, 404))
 def get_observation_summary(marker_id: MarkerId, caller: Caller, observations: Observations) -> Response:
     """Summarise the observations of a marker.
 
@@ -300,7 +306,7 @@ def get_observation_summary(marker_id: MarkerId, caller: Caller, observations: O
 # === POST /v1/markers/bulk: many markers in one request, a result for each.
 
 
-bulk_router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
+bulk_router = Router("/v1/markers", "markers")
 
 MAX_ITEMS = 1000
 _MAX_TEXT_BYTES = 160  # source: 1,000 problems of four texts then take less than 1 MB
@@ -369,6 +375,8 @@ Bulk = Annotated[BulkMarkersService, use_case(lambda cases: cases.bulk_markers)]
 
 @bulk_router.post(
     "/bulk",
+    SURVEYORS,
+    expensive=True,
     responses={
         200: {"model": BulkReport, "description": "Stored, or checked"},
         **problem_responses(409, refused=RefusedItems),
@@ -382,7 +390,7 @@ def post_bulk(body: BulkIn, request: Request, caller: Caller, bulk: Bulk, idempo
     Refused items of the mode `all` answer 422, with the report in the problem; nothing is stored then.
     """
     if any(isinstance(item, dict) and "create" in item for item in body.items):
-        caller.require(PERMISSIONS["POST /v1/markers"])
+        caller.require(PLANNERS)  # as POST /v1/markers
     items = [_read(item) for item in body.items]
     report, replayed = bulk.run(
         caller, BulkInput(items, body.mode, body.dry_run, body.warnings), partial(_described, body.items), idempotency

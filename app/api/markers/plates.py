@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import Depends, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, read_declaration
 from app.api.http.dependencies import Caller, Identifier, Number, Text, use_case
+from app.api.http.permissions import READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, document_response, file_response, json_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.encoders.plate import ArtworkFormat, ArtworkOptions
 from app.errors import InvalidParameter, UnreadableUpload, naming
 from app.families.documents import POSITION_EXAMPLE, Flag, PositionIn, StrictModel
@@ -107,7 +108,7 @@ class CameraViewIn(CameraPassIn):
 # === /v1/plate-drafts: plates before they are registered. Nothing is stored.
 
 
-draft_router = APIRouter(prefix="/v1/plate-drafts", tags=["artwork"], route_class=StrictRoute)
+draft_router = Router("/v1/plate-drafts", "artwork")
 
 _ARTWORK_HEADERS = {"Waymark-Proof": "What the decoder read from the drawing."}
 _VIEW_HEADERS = {
@@ -123,7 +124,7 @@ _VIEW_HEADERS = {
 Drafts = Annotated[PlateDrafts, use_case(lambda cases: cases.plate_drafts)]
 
 
-@draft_router.post("", responses=document_response(PlateDraftDocument))
+@draft_router.post("", READERS, responses=document_response(PlateDraftDocument))
 def post_plate_draft(wanted: PlateDraftIn, caller: Caller, drafts: Drafts) -> Response:
     """Design a plate that is not registered.
 
@@ -137,6 +138,8 @@ def post_plate_draft(wanted: PlateDraftIn, caller: Caller, drafts: Drafts) -> Re
 
 @draft_router.post(
     "/artwork.{form}",
+    READERS,
+    expensive=True,
     responses={
         **file_response((form.media_type for form in ArtworkFormat), headers=_ARTWORK_HEADERS),
         **problem_responses(),
@@ -157,7 +160,7 @@ def post_draft_artwork(form: ArtworkFormat, wanted: DraftArtworkIn, caller: Call
     return Response(artwork.content, headers=headers, media_type=artwork.media_type)
 
 
-@draft_router.post("/pass", responses=document_response(CameraPassDocument))
+@draft_router.post("/pass", READERS, responses=document_response(CameraPassDocument))
 def post_camera_pass(wanted: CameraPassIn, caller: Caller, drafts: Drafts) -> Response:
     """Predict what a camera reads of a plate as it passes.
 
@@ -170,6 +173,8 @@ def post_camera_pass(wanted: CameraPassIn, caller: Caller, drafts: Drafts) -> Re
 
 @draft_router.post(
     "/view",
+    READERS,
+    expensive=True,
     responses={**file_response(["image/jpeg"], "The picture", headers=_VIEW_HEADERS), **problem_responses()},
 )
 def post_camera_view(wanted: CameraViewIn, caller: Caller, drafts: Drafts) -> Response:
@@ -246,7 +251,7 @@ class PrintGradeIn(StrictModel):
 # === /v1/print-grades: a photo of a printed plate -> the grade of its print.
 
 
-print_grade_router = APIRouter(prefix="/v1", tags=["artwork"], route_class=StrictRoute)
+print_grade_router = Router("/v1", "artwork")
 
 MAX_DECLARATION_BYTES = 16 * 1024
 _CURE = "send multipart/form-data with a file in the part photo, and a part declaration"
@@ -297,6 +302,8 @@ Asked = Annotated[_Asked, Depends(get_asked)]
 
 @print_grade_router.post(
     "/print-grades",
+    READERS,
+    expensive=True,
     openapi_extra=_BODY,
     responses={
         200: {

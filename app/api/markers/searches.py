@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import Depends, Query, Request, Response
 from pydantic import ConfigDict, Field, model_validator
 
 from app.api.http.dependencies import AfterLink, Caller, Identifier, LastId, Number, PageSize, Text, use_case
+from app.api.http.permissions import READERS
 from app.api.http.responses import checked_id, cursor_of, document_response, json_response, page_response, parse_time
-from app.api.http.strict_json import AnyPolygon, GeoLineIn, StrictRoute
+from app.api.http.routes import Router
+from app.api.http.strict_json import AnyPolygon, GeoLineIn
 from app.errors import InvalidParameter
 from app.families import FamilyName
 from app.families.documents import Metres, StrictModel
@@ -187,7 +189,7 @@ class SearchIn(StrictModel):
 # === Finding markers.
 
 
-router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
+router = Router("/v1/markers", "markers")
 
 Searches = Annotated[SearchesService, use_case(lambda cases: cases.searches)]
 
@@ -261,7 +263,7 @@ class _Search:
         return searches.nearest(caller, self.filtered, self.place, self.nearest, self.radius_m)
 
 
-@router.get("", responses=document_response(MarkerPage))
+@router.get("", READERS, responses=document_response(MarkerPage))
 def list_markers(
     request: Request,
     caller: Caller,
@@ -296,7 +298,7 @@ def list_markers(
     return search.answer(request, caller, searches, limit=limit, after=after)
 
 
-@router.post("/search", responses=document_response(MarkerPage))
+@router.post("/search", READERS, expensive=True, responses=document_response(MarkerPage))
 def search_markers(
     body: SearchIn, request: Request, caller: Caller, searches: Searches, limit: PageSize = 100, after: AfterLink = None
 ) -> Response:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends
+from fastapi import Depends
 from starlette.responses import Response
 
 from app import __version__
 from app.api.http.dependencies import Caller
-from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
-from app.api.http.strict_json import StrictRoute
+from app.api.http.permissions import READERS, SECURITY, SECURITY_SCHEMES
+from app.api.http.routes import Router
 from app.api.ogc import pages
 from app.api.ogc.edits import READ_ONLY
 from app.api.ogc.pages import html_response
@@ -248,15 +248,15 @@ CONFORMANCE = (
 )
 
 
-router = APIRouter(prefix="/ogc", tags=["ogc"], route_class=StrictRoute)
+router = Router("/ogc", "ogc")
 IsPage = Annotated[bool, Depends(Offers(JSON, html=True))]
 IsSchemaPage = Annotated[bool, Depends(Offers(SCHEMA, JSON, html=True))]
 OffersSchema = Annotated[bool, Depends(Offers(SCHEMA, JSON))]
 IsApiPage = Annotated[bool, Depends(Offers(OPENAPI, JSON, html=True))]
 
 
-@router.get("", **describe_read(LandingPage))
-@router.get("/", name="landing_page_with_slash", **describe_read(LandingPage))
+@router.get("", READERS, **describe_read(LandingPage))
+@router.get("/", READERS, name="landing_page_with_slash", **describe_read(LandingPage))
 def landing_page(is_page: IsPage, base: BaseUrl) -> Response:
     """Get the landing page.
 
@@ -276,7 +276,7 @@ def landing_page(is_page: IsPage, base: BaseUrl) -> Response:
     return html_response(pages.landing_page(base, document)) if is_page else answer(document)
 
 
-@router.get("/conformance", **describe_read(Conformance))
+@router.get("/conformance", READERS, **describe_read(Conformance))
 def get_conformance(is_page: IsPage, base: BaseUrl) -> Response:
     """List the conformance classes."""
     if is_page:
@@ -284,7 +284,7 @@ def get_conformance(is_page: IsPage, base: BaseUrl) -> Response:
     return answer(Conformance(conformsTo=list(CONFORMANCE)))
 
 
-@router.get("/api", **describe_read(JsonObject, OPENAPI.partition(";")[0]))
+@router.get("/api", READERS, **describe_read(JsonObject, OPENAPI.partition(";")[0]))
 def get_api(is_page: IsApiPage, base: BaseUrl) -> Response:
     """Get the OpenAPI 3.0 document of the OGC API.
 
@@ -294,7 +294,7 @@ def get_api(is_page: IsApiPage, base: BaseUrl) -> Response:
     return html_response(pages.api_page(base, document)) if is_page else answer(document, OPENAPI)
 
 
-@router.get("/collections", **describe_read(Collections))
+@router.get("/collections", READERS, **describe_read(Collections))
 def list_collections(is_page: IsPage, base: BaseUrl, caller: Caller, features: FeaturesService) -> Response:
     """List the collections."""
     found = [_described(collection, features.extent(caller, collection), base) for collection in COLLECTIONS.values()]
@@ -312,7 +312,7 @@ def list_collections(is_page: IsPage, base: BaseUrl, caller: Caller, features: F
     return answer(document)
 
 
-@router.get("/collections/{collection}", **describe_read(CollectionDocument))
+@router.get("/collections/{collection}", READERS, **describe_read(CollectionDocument))
 def get_collection(
     collection: CollectionOf, is_page: IsPage, base: BaseUrl, caller: Caller, features: FeaturesService
 ) -> Response:
@@ -321,7 +321,7 @@ def get_collection(
     return html_response(pages.collection_page(base, document, collection)) if is_page else answer(document)
 
 
-@router.get("/collections/{collection}/schema", **describe_read(JsonObject, SCHEMA))
+@router.get("/collections/{collection}/schema", READERS, **describe_read(JsonObject, SCHEMA))
 def get_schema(collection: CollectionOf, is_page: IsSchemaPage, base: BaseUrl) -> Response:
     """Get the schema of a collection's properties.
 
@@ -332,13 +332,13 @@ def get_schema(collection: CollectionOf, is_page: IsSchemaPage, base: BaseUrl) -
     return answer(property_schema(collection, f"{base}/collections/{collection.id}/schema"), SCHEMA)
 
 
-@router.get("/collections/{collection}/geojson-schema", **describe_read(JsonObject, SCHEMA, html=False))
+@router.get("/collections/{collection}/geojson-schema", READERS, **describe_read(JsonObject, SCHEMA, html=False))
 def get_geojson_schema(collection: CollectionOf, _offers: OffersSchema, base: BaseUrl) -> Response:
     """Get the schema of a collection's features in GeoJSON."""
     return answer(geojson_schema(collection, f"{base}/collections/{collection.id}/geojson-schema"), SCHEMA)
 
 
-@router.get("/collections/{collection}/queryables", **describe_read(JsonObject, SCHEMA))
+@router.get("/collections/{collection}/queryables", READERS, **describe_read(JsonObject, SCHEMA))
 def get_queryables(collection: CollectionOf, is_page: IsSchemaPage, base: BaseUrl) -> Response:
     """Get the properties that filters of a collection can use.
 

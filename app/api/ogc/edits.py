@@ -11,15 +11,16 @@ from functools import partial
 from typing import Annotated, Any
 
 import orjson
-from fastapi import APIRouter, Depends, Header, Request
+from fastapi import Depends, Header, Request
 from pydantic import TypeAdapter
 from starlette.responses import Response
 
 from app.api.http.bodies import media_type_of
 from app.api.http.dependencies import Caller, Markers, SentVersion
-from app.api.http.permissions import PERMISSIONS
+from app.api.http.permissions import PLANNERS, READERS, SURVEYORS
 from app.api.http.problems import problem_responses, reference
-from app.api.http.strict_json import StrictRoute, in_thread_if_large, validated
+from app.api.http.routes import Router
+from app.api.http.strict_json import in_thread_if_large, validated
 from app.api.markers.markers import WARNINGS_TEXT, MarkerPatch, NewMarkerIn, patch_marker, post_marker
 from app.api.ogc.responses import (
     GEOJSON,
@@ -56,7 +57,7 @@ _BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
 _WITH_BODY = {
     "requestBody": {"content": {kind: {"schema": reference(NewFeature)} for kind in _BODY_TYPES}, "required": True}
 }
-router = APIRouter(prefix="/ogc/collections/{collection}/items", tags=["ogc"], route_class=StrictRoute)
+router = Router("/ogc/collections/{collection}/items", "ogc")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ Edit = Annotated[_Edit, Depends(get_edit)]
 Body = Annotated[dict[str, Any], Depends(get_body)]
 
 
-@router.options("", responses=problem_responses(404))
+@router.options("", READERS, responses=problem_responses(404))
 async def list_collection_methods(request: Request, collection: CollectionOf, caller: Caller) -> Response:
     """List the methods that the caller may use on a collection.
 
@@ -124,7 +125,7 @@ async def list_collection_methods(request: Request, collection: CollectionOf, ca
     return _allowed(request, collection, caller, "POST")
 
 
-@router.options("/{feature}", responses=problem_responses(404))
+@router.options("/{feature}", READERS, responses=problem_responses(404))
 async def list_feature_methods(request: Request, collection: CollectionOf, caller: Caller, feature: str) -> Response:
     """List the methods that the caller may use on a feature.
 
@@ -136,12 +137,12 @@ async def list_feature_methods(request: Request, collection: CollectionOf, calle
 def _allowed(request: Request, collection: Collection, caller: CallerValue, *edits: str) -> Response:
     allowed = ["GET", "HEAD", "OPTIONS"]
     if collection.editable:
-        path = request.scope["route"].path
-        allowed += [method for method in edits if caller.scope in PERMISSIONS[f"{method} {path}"]]
+        path, permissions = request.scope["route"].path, request.app.state.permissions
+        allowed += [method for method in edits if caller.scope in permissions[f"{method} {path}"]]
     return Response(headers={"Allow": ", ".join(allowed)})
 
 
-@router.post("", status_code=201, responses=problem_responses(404, 409), openapi_extra=_WITH_BODY)
+@router.post("", PLANNERS, status_code=201, responses=problem_responses(404, 409), openapi_extra=_WITH_BODY)
 def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
     """Register a marker as a feature.
 
@@ -159,7 +160,9 @@ def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
     return Response(status_code=201, headers={"Location": where, **_warned(made)})
 
 
-@router.put("/{feature}", status_code=204, responses=problem_responses(404, 409, 412), openapi_extra=_WITH_BODY)
+@router.put(
+    "/{feature}", SURVEYORS, status_code=204, responses=problem_responses(404, 409, 412), openapi_extra=_WITH_BODY
+)
 def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Replace a marker by a feature.
 
@@ -178,13 +181,15 @@ def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentV
     return _change({"properties": given, "geometry": feature["geometry"]}, edit, feature_id, version)
 
 
-@router.patch("/{feature}", status_code=204, responses=problem_responses(404, 409, 412), openapi_extra=_WITH_BODY)
+@router.patch(
+    "/{feature}", SURVEYORS, status_code=204, responses=problem_responses(404, 409, 412), openapi_extra=_WITH_BODY
+)
 def patch_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Change properties or the position of a marker."""
     return _change(feature, edit, feature_id, version)
 
 
-@router.delete("/{feature}", status_code=204, responses=problem_responses(404, 409, 412))
+@router.delete("/{feature}", PLANNERS, status_code=204, responses=problem_responses(404, 409, 412))
 def delete_feature(edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Retire a marker."""
     edit.features.get(edit.caller, edit.collection, feature_id)

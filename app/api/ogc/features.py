@@ -6,11 +6,11 @@ from datetime import UTC, datetime
 from typing import cast
 
 import orjson
-from fastapi import APIRouter
 from starlette.responses import Response
 
 from app.api.http.dependencies import Caller
-from app.api.http.strict_json import StrictRoute
+from app.api.http.permissions import READERS
+from app.api.http.routes import Router
 from app.api.ogc.pages import html_response, item_page, items_page
 from app.api.ogc.query import OF_ITEM, OF_ITEMS, OF_TILE, PARAMETERS, ItemsQuery
 from app.api.ogc.responses import (
@@ -33,11 +33,11 @@ from app.api.ogc.responses import (
     with_query,
 )
 
-router = APIRouter(prefix="/ogc/collections/{collection}/items", tags=["ogc"], route_class=StrictRoute)
+router = Router("/ogc/collections/{collection}/items", "ogc")
 _FILTERS = [name for name in PARAMETERS if name not in (*OF_ITEMS, *OF_TILE)]
 
 
-@router.get("", **describe_read(FeaturePage, GEOJSON, parameters=(*OF_ITEMS, *_FILTERS)))
+@router.get("", READERS, **describe_read(FeaturePage, GEOJSON, parameters=(*OF_ITEMS, *_FILTERS)))
 @in_own_threads
 def list_items(
     collection: CollectionOf, query: ItemsQueryOf, base: BaseUrl, caller: Caller, features: FeaturesService
@@ -75,7 +75,7 @@ def list_items(
     return answer(document, GEOJSON, crs=query.crs)
 
 
-@router.get("/{feature}", **describe_read(Feature, GEOJSON, parameters=OF_ITEM))
+@router.get("/{feature}", READERS, **describe_read(Feature, GEOJSON, parameters=OF_ITEM))
 def get_item(
     collection: CollectionOf,
     query: ItemQueryOf,

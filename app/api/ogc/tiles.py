@@ -6,13 +6,14 @@ import math
 import re
 from typing import Annotated, Any, NotRequired, TypedDict
 
-from fastapi import APIRouter, Depends, Path, Request
+from fastapi import Depends, Path, Request
 from starlette.responses import Response
 
 from app.api.http.dependencies import Caller
+from app.api.http.permissions import READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import file_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.api.ogc.query import OF_TILE, described, flag_parameter, known_parameters
 from app.api.ogc.responses import (
     JSON,
@@ -201,7 +202,7 @@ def _symbols(collection: Collection, looks: dict[str, str]) -> list[dict[str, An
 # === OGC API Tiles.
 
 
-router = APIRouter(prefix="/ogc", tags=["ogc"], route_class=StrictRoute)
+router = Router("/ogc", "ogc")
 MATRIX_SET = "WebMercatorQuad"
 MATRIX_SET_URI = f"http://www.opengis.net/def/tilematrixset/OGC/1.0/{MATRIX_SET}"
 TILES_REL = "http://www.opengis.net/def/rel/ogc/1.0/tilesets-vector"
@@ -271,6 +272,7 @@ OffersStyle = Annotated[bool, Depends(Offers(MAP_STYLE, JSON))]
 
 @router.get(
     "/collections/{collection}/tiles/{matrix_set}/{zoom}/{row}/{column}",
+    READERS,
     responses={**file_response([MVT]), 204: {"description": "No features"}, **problem_responses(404, 406)},
     openapi_extra={"parameters": [described(name, ("mvt", "pbf")) for name in OF_TILE]},
 )
@@ -294,7 +296,7 @@ def get_tile(
     return Response(content, headers=headers, media_type=MVT)
 
 
-@router.get("/collections/{collection}/tiles", **describe_read(TileSets, html=False))
+@router.get("/collections/{collection}/tiles", READERS, **describe_read(TileSets, html=False))
 def list_tilesets(collection: Tiled, _offers: OffersJson, base: BaseUrl) -> Response:
     """List the tile sets of a collection.
 
@@ -303,13 +305,13 @@ def list_tilesets(collection: Tiled, _offers: OffersJson, base: BaseUrl) -> Resp
     return answer(TileSets(tilesets=[_tileset(base, collection)]))
 
 
-@router.get("/collections/{collection}/tiles/{matrix_set}", **describe_read(TileSet, html=False))
+@router.get("/collections/{collection}/tiles/{matrix_set}", READERS, **describe_read(TileSet, html=False))
 def get_tileset(collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl) -> Response:
     """Get a tile set of a collection."""
     return answer(_tileset(base, collection))
 
 
-@router.get("/collections/{collection}/tiles/{matrix_set}/tilejson", **describe_read(JsonObject, html=False))
+@router.get("/collections/{collection}/tiles/{matrix_set}/tilejson", READERS, **describe_read(JsonObject, html=False))
 def get_tilejson(
     collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl, caller: Caller,
     features: FeaturesService,
@@ -318,7 +320,9 @@ def get_tilejson(
     return answer(tilejson(collection, _template(base, collection), features.extent(caller, collection)))
 
 
-@router.get("/collections/{collection}/tiles/{matrix_set}/style", **describe_read(JsonObject, MAP_STYLE, html=False))
+@router.get(
+    "/collections/{collection}/tiles/{matrix_set}/style", READERS, **describe_read(JsonObject, MAP_STYLE, html=False)
+)
 def get_map_style(
     collection: Tiled, _matrix_set: MatrixSet, _offers: OffersStyle, base: BaseUrl, caller: Caller,
     features: FeaturesService,
@@ -332,7 +336,7 @@ def get_map_style(
     return answer(map_style(collection, _template(base, collection), sprite_url, extent), MAP_STYLE)
 
 
-@router.get("/tileMatrixSets", **describe_read(TileMatrixSets, html=False))
+@router.get("/tileMatrixSets", READERS, **describe_read(TileMatrixSets, html=False))
 def list_matrix_sets(_offers: OffersJson, base: BaseUrl) -> Response:
     """List the tile matrix sets.
 
@@ -342,7 +346,7 @@ def list_matrix_sets(_offers: OffersJson, base: BaseUrl) -> Response:
     return answer(TileMatrixSets(tileMatrixSets=[{"id": MATRIX_SET, "uri": MATRIX_SET_URI, "links": links}]))
 
 
-@router.get("/tileMatrixSets/{matrix_set}", **describe_read(TileMatrixSet, html=False))
+@router.get("/tileMatrixSets/{matrix_set}", READERS, **describe_read(TileMatrixSet, html=False))
 def get_matrix_set(_matrix_set: MatrixSet, _offers: OffersJson) -> Response:
     """Get a tile matrix set."""
     matrices: list[TileMatrix] = [

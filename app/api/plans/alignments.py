@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import Depends, Path, Query, Request, Response
 
 from app.api.http.bodies import (
     FORM,
@@ -20,6 +20,7 @@ from app.api.http.bodies import (
     received_form,
 )
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_case
+from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses, reference
 from app.api.http.responses import (
     BINARY,
@@ -33,7 +34,7 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.api.markers.searches import Filtered
 from app.api.plans.schemas import AlignmentIn, RoadAlignmentIn
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
@@ -43,7 +44,7 @@ from app.services.plans.alignments import Alignments
 from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
 from app.services.plans.tasks import MAX_SAMPLES, MapForm
 
-router = APIRouter(prefix="/v1/alignments", tags=["plans"], route_class=StrictRoute)
+router = Router("/v1/alignments", "plans")
 
 MAX_DECLARATION_BYTES = 64 * 1024
 MAX_WITHIN_M = 100.0
@@ -107,6 +108,8 @@ def _check_length(declaration: bytes) -> None:
 
 @router.post(
     "",
+    PLANNERS,
+    expensive=True,
     status_code=201,
     openapi_extra=_BODY,
     responses=document_response(AlignmentDocument, 404, 409, 415, status=201, description="Stored"),
@@ -128,7 +131,7 @@ def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Call
     return created_response(document, replayed, path="/v1/alignments")
 
 
-@router.get("", responses=document_response(AlignmentPage))
+@router.get("", READERS, responses=document_response(AlignmentPage))
 def list_alignments(
     request: Request, caller: Caller, alignments: Service, limit: PageSize = 100, after: LastId = None
 ) -> Response:
@@ -140,7 +143,7 @@ def list_alignments(
     return page_response(request, page, after=last)
 
 
-@router.get("/{alignment_id}", responses={**NOT_MODIFIED, **document_response(AlignmentDocument, 404)})
+@router.get("/{alignment_id}", READERS, responses={**NOT_MODIFIED, **document_response(AlignmentDocument, 404)})
 def get_alignment(
     alignment_id: AlignmentId, caller: Caller, alignments: Service, if_none_match: IfNoneMatch = None
 ) -> Response:
@@ -153,6 +156,7 @@ def get_alignment(
 
 @router.get(
     "/{alignment_id}/source",
+    READERS,
     responses={**file_response(["application/octet-stream"], "The file as it came"), **problem_responses(404)},
 )
 def get_source(alignment_id: AlignmentId, caller: Caller, alignments: Service) -> Response:
@@ -161,7 +165,7 @@ def get_source(alignment_id: AlignmentId, caller: Caller, alignments: Service) -
     return Response(data, media_type="application/octet-stream")
 
 
-@router.get("/{alignment_id}/profile", responses=document_response(AlignmentProfile, 404))
+@router.get("/{alignment_id}/profile", READERS, expensive=True, responses=document_response(AlignmentProfile, 404))
 def get_profile(
     alignment_id: AlignmentId,
     caller: Caller,
@@ -177,6 +181,8 @@ def get_profile(
 
 @router.get(
     "/{alignment_id}/map.{form}",
+    READERS,
+    expensive=True,
     responses={**file_response(["application/xml"], "The map"), **problem_responses(404)},
 )
 def get_map(

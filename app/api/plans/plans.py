@@ -6,7 +6,7 @@ from functools import cache
 from typing import Annotated, Any, Literal, cast
 
 import orjson
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from app.api.http.dependencies import (
@@ -20,6 +20,7 @@ from app.api.http.dependencies import (
     Version,
     use_case,
 )
+from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -33,7 +34,7 @@ from app.api.http.responses import (
     versioned_response,
     wants_job,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.api.plans.schemas import PackageIn, PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
 from app.planning.outputs.package import MEDIA_TYPES
 from app.planning.rules import read_rules, rules_schema
@@ -57,7 +58,7 @@ from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, PlanJobDocument,
 # === /v1/plan-rules and /v1/plan-previews: rules of plans, and what they would place.
 
 
-rule_router = APIRouter(prefix="/v1", tags=["plans"], route_class=StrictRoute)
+rule_router = Router("/v1", "plans")
 
 SCHEMA_TYPE = "application/schema+json"
 _SCHEMA: dict[int | str, dict[str, Any]] = {
@@ -65,7 +66,7 @@ _SCHEMA: dict[int | str, dict[str, Any]] = {
 }
 
 
-@rule_router.get("/plan-rules/schema", responses={**_SCHEMA, **problem_responses()})
+@rule_router.get("/plan-rules/schema", READERS, responses={**_SCHEMA, **problem_responses()})
 def get_rules_schema(caller: Caller) -> Response:
     """Get the JSON Schema of rules.
 
@@ -74,7 +75,7 @@ def get_rules_schema(caller: Caller) -> Response:
     return Response(_schema(), media_type=SCHEMA_TYPE)
 
 
-@rule_router.post("/plan-rules", responses=document_response(ReadRules))
+@rule_router.post("/plan-rules", PLANNERS, expensive=True, responses=document_response(ReadRules))
 def post_rules_text(wanted: RulesTextIn, caller: Caller) -> Response:
     """Read and check rules of a file.
 
@@ -84,7 +85,7 @@ def post_rules_text(wanted: RulesTextIn, caller: Caller) -> Response:
     return json_response(ReadRules(rules=rules.model_dump(mode="json", exclude_unset=True, by_alias=True)))
 
 
-@rule_router.post("/plan-previews", responses=document_response(PlanPreview, 404))
+@rule_router.post("/plan-previews", PLANNERS, expensive=True, responses=document_response(PlanPreview, 404))
 def post_plan_preview(
     request: Request,
     wanted: PlanPreviewIn,
@@ -112,7 +113,7 @@ def _schema() -> bytes:
 # === /v1/plan-jobs: progress, results and cancelling of jobs about plans.
 
 
-job_router = APIRouter(prefix="/v1/plan-jobs", tags=["plans"], route_class=StrictRoute)
+job_router = Router("/v1/plan-jobs", "plans")
 
 JobId = Annotated[Identifier, Path(description="Id of the job.")]
 JobService = Annotated[PlanJobs, use_case(lambda cases: cases.plan_jobs)]
@@ -125,7 +126,7 @@ def queued_response(job: PlanJobDocument, replayed: bool) -> Response:
     return response
 
 
-@job_router.get("", responses=document_response(PlanJobPage))
+@job_router.get("", READERS, responses=document_response(PlanJobPage))
 def list_plan_jobs(
     request: Request,
     caller: Caller,
@@ -143,7 +144,7 @@ def list_plan_jobs(
     return page_response(request, page, after=last)
 
 
-@job_router.get("/{job_id}", responses=document_response(PlanJobDocument, 404))
+@job_router.get("/{job_id}", READERS, responses=document_response(PlanJobDocument, 404))
 def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
     """Get a job about a plan.
 
@@ -154,7 +155,7 @@ def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-@job_router.post("/{job_id}/cancel", responses=document_response(PlanJobDocument, 404))
+@job_router.post("/{job_id}/cancel", PLANNERS, responses=document_response(PlanJobDocument, 404))
 def cancel_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
     """Cancel a job about a plan.
 
@@ -166,7 +167,7 @@ def cancel_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response
 # === /v1/plans.
 
 
-router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
+router = Router("/v1/plans", "plans")
 
 FOLLOWS_MARKERS = ("committed", "built", "surveyed")
 """Statuses that change when markers do, without a new version of the plan."""
@@ -176,6 +177,8 @@ Service = Annotated[Plans, use_case(lambda cases: cases.plans)]
 
 @router.post(
     "",
+    PLANNERS,
+    expensive=True,
     status_code=201,
     responses={
         201: {"model": PlanDocument, "description": "Made"},
@@ -206,7 +209,7 @@ def post_plan(
     return created_response(document, replayed, path="/v1/plans")
 
 
-@router.get("", responses=document_response(PlanPage))
+@router.get("", READERS, responses=document_response(PlanPage))
 def list_plans(
     request: Request,
     caller: Caller,
@@ -224,7 +227,7 @@ def list_plans(
     return page_response(request, page, after=last)
 
 
-@router.get("/{plan_id}", responses={**NOT_MODIFIED, **document_response(PlanDocument, 404)})
+@router.get("/{plan_id}", READERS, responses={**NOT_MODIFIED, **document_response(PlanDocument, 404)})
 def get_plan(plan_id: PlanId, caller: Caller, plans: Service, if_none_match: IfNoneMatch = None) -> Response:
     """Get a plan with its findings.
 
@@ -234,7 +237,7 @@ def get_plan(plan_id: PlanId, caller: Caller, plans: Service, if_none_match: IfN
     return versioned_response(plan, None if plan["status"] in FOLLOWS_MARKERS else if_none_match)
 
 
-@router.patch("/{plan_id}", responses=document_response(PlanDocument, 404, 409, 412, 428))
+@router.patch("/{plan_id}", PLANNERS, expensive=True, responses=document_response(PlanDocument, 404, 409, 412, 428))
 def patch_plan(plan_id: PlanId, patch: PlanPatch, caller: Caller, plans: Service, version: Version) -> Response:
     """Rename a plan, or make it again by other rules.
 
@@ -244,7 +247,7 @@ def patch_plan(plan_id: PlanId, patch: PlanPatch, caller: Caller, plans: Service
     return versioned_response(changed)
 
 
-@router.get("/{plan_id}/versions", responses=document_response(PlanVersionPage, 404))
+@router.get("/{plan_id}/versions", READERS, responses=document_response(PlanVersionPage, 404))
 def list_plan_versions(
     request: Request, plan_id: PlanId, caller: Caller, plans: Service, limit: PageSize = 100, after: AfterVersion = 0
 ) -> Response:
@@ -258,6 +261,8 @@ def list_plan_versions(
 
 @router.get(
     "/{plan_id}/files/{name}",
+    READERS,
+    expensive=True,
     responses={**file_response(sorted(set(MEDIA_TYPES.values()))), **problem_responses(404)},
 )
 def get_plan_file(
@@ -285,7 +290,7 @@ def get_plan_file(
     return Response(data, media_type=media_type, headers=headers)
 
 
-@router.post("/{plan_id}/approve", responses=document_response(PlanDocument, 404, 409, 412, 428))
+@router.post("/{plan_id}/approve", PLANNERS, responses=document_response(PlanDocument, 404, 409, 412, 428))
 def approve_plan(plan_id: PlanId, caller: Caller, plans: Service, version: Version) -> Response:
     """Approve a plan.
 
@@ -296,6 +301,8 @@ def approve_plan(plan_id: PlanId, caller: Caller, plans: Service, version: Versi
 
 @router.post(
     "/{plan_id}/commit",
+    PLANNERS,
+    expensive=True,
     status_code=201,
     responses=document_response(CommittedPlan, 404, 409, 412, 428, status=201, description="Committed"),
 )
@@ -310,7 +317,7 @@ def commit_plan(
     return created_response(document, replayed)
 
 
-@router.get("/{plan_id}/as-built", responses=document_response(AsBuiltDocument, 404))
+@router.get("/{plan_id}/as-built", READERS, expensive=True, responses=document_response(AsBuiltDocument, 404))
 def get_as_built(plan_id: PlanId, caller: Caller, plans: Service) -> Response:
     """Compare a plan with what was built and surveyed.
 
@@ -322,13 +329,14 @@ def get_as_built(plan_id: PlanId, caller: Caller, plans: Service) -> Response:
 # === /v1/plans/{plan_id}/package: all files of a plan in one ZIP.
 
 
-package_router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
+package_router = Router("/v1/plans", "plans")
 
 PackageService = Annotated[Packages, use_case(lambda cases: cases.packages)]
 
 
 @package_router.post(
     "/{plan_id}/package",
+    PLANNERS,
     status_code=202,
     responses=document_response(
         PlanJobDocument, 404, 409, status=202, description="Queued; Location leads to its progress"
@@ -348,6 +356,7 @@ def post_package(
 
 @package_router.get(
     "/{plan_id}/package",
+    READERS,
     response_class=StreamingResponse,
     responses={**file_response(["application/zip"], "The package"), **NOT_MODIFIED, **problem_responses(404)},
 )
@@ -372,13 +381,14 @@ def get_package(
 # === /v1/plans/{plan_id}/proof: what simulated vehicles read of a plan.
 
 
-proof_router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
+proof_router = Router("/v1/plans", "plans")
 
 ProofService = Annotated[Proofs, use_case(lambda cases: cases.proofs)]
 
 
 @proof_router.post(
     "/{plan_id}/proof",
+    PLANNERS,
     status_code=202,
     responses=document_response(
         PlanJobDocument, 404, 409, 412, 428, status=202, description="Queued; Location leads to its progress"
@@ -398,7 +408,9 @@ def post_proof(
     return queued_response(*proofs.request(caller, plan_id, terms, version, idempotency))
 
 
-@proof_router.get("/{plan_id}/proof", responses={**document_response(ProofDocument, 404), **problem_responses(404)})
+@proof_router.get(
+    "/{plan_id}/proof", READERS, responses={**document_response(ProofDocument, 404), **problem_responses(404)}
+)
 def get_proof(plan_id: PlanId, caller: Caller, proofs: ProofService) -> Response:
     """Get the report of a plan's latest proof.
 

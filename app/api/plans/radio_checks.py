@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from fastapi import Response
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.dependencies import Caller, Number, Whole
+from app.api.http.permissions import READERS
 from app.api.http.responses import document_response, json_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.errors import naming
 from app.families.cerpm import RadioIn
 from app.families.documents import Flag, StrictModel
@@ -16,7 +17,7 @@ from app.radio.reception import MAX_MARKERS, Receiver, RoadMarkers
 from app.radio.settings import Battery, Region
 from app.services.plans.documents import RadioCheckDocument, check_plan
 
-router = APIRouter(prefix="/v1/radio-checks", tags=["cerpms"], route_class=StrictRoute)
+router = Router("/v1/radio-checks", "cerpms")
 
 _EXAMPLES: list[JsonValue] = [
     {"radio": {"spreading_factor": 7, "bandwidth_hz": 500_000, "interval_s": 2.0}, "design_speed_mps": 13.4},
@@ -110,7 +111,7 @@ class RadioCheckIn(StrictModel):
         )
 
 
-@router.post("", responses=document_response(RadioCheckDocument))
+@router.post("", READERS, expensive=True, responses=document_response(RadioCheckDocument))
 def post_radio_check(wanted: RadioCheckIn, caller: Caller) -> Response:
     """Check the radios of CERPMs on a road.
 

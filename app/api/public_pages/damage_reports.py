@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, Version, use_case
+from app.api.http.permissions import ADMINS, READERS, SURVEYORS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -18,7 +19,7 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.families.documents import Flag, StrictModel
 from app.services.public_pages.pages import (
     DamageReport,
@@ -31,7 +32,7 @@ from app.services.public_pages.pages import (
 )
 from app.services.public_pages.reports import DamageReports
 
-router = APIRouter(prefix="/v1/damage-reports", tags=["public pages"], route_class=StrictRoute)
+router = Router("/v1/damage-reports", "public pages")
 
 ReportId = Annotated[Identifier, Path(description="Id of the report.")]
 Service = Annotated[DamageReports, use_case(lambda cases: cases.damage_reports)]
@@ -54,7 +55,7 @@ class RejectionIn(StrictModel):
     reason: Text = Field(min_length=1, max_length=300)
 
 
-@router.get("", responses=document_response(DamageReportPage))
+@router.get("", READERS, responses=document_response(DamageReportPage))
 def list_damage_reports(
     request: Request,
     caller: Caller,
@@ -72,13 +73,13 @@ def list_damage_reports(
     return page_response(request, page, after=last)
 
 
-@router.get("/{report_id}", responses=document_response(DamageReport, 404))
+@router.get("/{report_id}", READERS, responses=document_response(DamageReport, 404))
 def get_damage_report(report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Get a damage report."""
     return json_response(reports.get(caller, report_id))
 
 
-@router.get("/{report_id}/photo", responses={**file_response(["image/jpeg"]), **problem_responses(404)})
+@router.get("/{report_id}/photo", READERS, responses={**file_response(["image/jpeg"]), **problem_responses(404)})
 def get_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Get the photo of a damage report.
 
@@ -87,7 +88,7 @@ def get_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> R
     return Response(reports.photo(caller, report_id), headers=_PHOTO_HEADERS, media_type="image/jpeg")
 
 
-@router.delete("/{report_id}/photo", status_code=204, responses=problem_responses(404))
+@router.delete("/{report_id}/photo", SURVEYORS, status_code=204, responses=problem_responses(404))
 def delete_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Delete the photo of a damage report.
 
@@ -97,7 +98,8 @@ def delete_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -
     return Response(status_code=204)
 
 
-@router.get("/{report_id}/contact", responses=document_response(ReportContact, 404))
+# an e-mail address is for those who decide
+@router.get("/{report_id}/contact", SURVEYORS, responses=document_response(ReportContact, 404))
 def get_report_contact(report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Get the e-mail address in a damage report.
 
@@ -106,7 +108,7 @@ def get_report_contact(report_id: ReportId, caller: Caller, reports: Service) ->
     return json_response(reports.contact(caller, report_id))
 
 
-@router.delete("/{report_id}/contact", status_code=204, responses=problem_responses(404))
+@router.delete("/{report_id}/contact", SURVEYORS, status_code=204, responses=problem_responses(404))
 def delete_report_contact(report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Delete the e-mail address in a damage report.
 
@@ -116,7 +118,7 @@ def delete_report_contact(report_id: ReportId, caller: Caller, reports: Service)
     return Response(status_code=204)
 
 
-@router.post("/{report_id}/accept", responses=document_response(DamageReport, 404, 409))
+@router.post("/{report_id}/accept", SURVEYORS, responses=document_response(DamageReport, 404, 409))
 def accept_damage_report(acceptance: AcceptanceIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Accept a damage report into the work list.
 
@@ -127,7 +129,7 @@ def accept_damage_report(acceptance: AcceptanceIn, report_id: ReportId, caller: 
     return json_response(reports.accept(caller, report_id, acceptance.note))
 
 
-@router.post("/{report_id}/reject", responses=document_response(DamageReport, 404, 409))
+@router.post("/{report_id}/reject", SURVEYORS, responses=document_response(DamageReport, 404, 409))
 def reject_damage_report(rejection: RejectionIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Reject a damage report with a reason."""
     return json_response(reports.reject(caller, report_id, rejection.reason))
@@ -136,7 +138,7 @@ def reject_damage_report(rejection: RejectionIn, report_id: ReportId, caller: Ca
 # === /v1/public-page: what an agency releases on the public pages of its markers.
 
 
-settings_router = APIRouter(prefix="/v1/public-page", tags=["public pages"], route_class=StrictRoute)
+settings_router = Router("/v1/public-page", "public pages")
 
 Pages = Annotated[PublicPages, use_case(lambda cases: cases.public_pages)]
 
@@ -159,13 +161,13 @@ class PublicPageIn(StrictModel):
     damage_reports: Flag = Field(description="Whether the pages have a form for damage reports.")
 
 
-@settings_router.get("", responses={**NOT_MODIFIED, **document_response(PublicPageDocument)})
+@settings_router.get("", READERS, responses={**NOT_MODIFIED, **document_response(PublicPageDocument)})
 def get_public_page_settings(caller: Caller, pages: Pages, if_none_match: IfNoneMatch = None) -> Response:
     """Get what an agency releases on its public pages."""
     return versioned_response(pages.settings(caller), if_none_match)
 
 
-@settings_router.put("", responses=document_response(PublicPageDocument, 412, 428))
+@settings_router.put("", ADMINS, responses=document_response(PublicPageDocument, 412, 428))
 def put_public_page_settings(settings: PublicPageIn, caller: Caller, pages: Pages, version: Version) -> Response:
     """Change what an agency releases on its public pages.
 

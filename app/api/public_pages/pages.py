@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import Annotated, Any, cast
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import Depends, Path, Query, Request, Response
 
 from app.api.http.bodies import FORM, received_form
 from app.api.http.dependencies import use_case
+from app.api.http.permissions import PUBLIC
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, json_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.api.public_pages.forms import (
     FIELDS,
     KINDS,
@@ -43,7 +44,7 @@ from app.services.public_pages.pages import (
 from app.services.public_pages.pages import ReportForm as ReportFormDocument
 from app.services.public_pages.reports import DamageReports
 
-router = APIRouter(prefix="/m", tags=["public pages"], route_class=StrictRoute)
+router = Router("/m", "public pages")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +119,7 @@ _BODY = {
 }
 
 
-@router.get("/{marker_id}", responses=_described(200, "What the agency releases", PublicMarkerDocument))
+@router.get("/{marker_id}", PUBLIC, responses=_described(200, "What the agency releases", PublicMarkerDocument))
 async def get_public_page(
     request: Request, marker_id: MarkerAddress, pages: Pages, tokens: Tokens, limits: Limits, form: Form,
     lang: Lang = None,
@@ -140,7 +141,7 @@ async def get_public_page(
     return page_response(marker_page(texts, marker, state), texts)
 
 
-@router.get("/{marker_id}/thanks", responses=_described(200, "A report was received"))
+@router.get("/{marker_id}/thanks", PUBLIC, responses=_described(200, "A report was received"))
 async def get_thanks(
     request: Request, marker_id: MarkerAddress, pages: Pages, limits: Limits, lang: Lang = None
 ) -> Response:
@@ -152,6 +153,7 @@ async def get_thanks(
 
 @router.post(
     "/{marker_id}/reports",
+    PUBLIC,
     status_code=201,
     openapi_extra=_BODY,
     responses={

@@ -6,12 +6,13 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import Depends, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, idempotency_of, read_declaration
 from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_case
+from app.api.http.permissions import READERS, SURVEYORS
 from app.api.http.problems import FieldError, Problem, problem_responses, report_problem
 from app.api.http.responses import (
     BINARY,
@@ -24,7 +25,7 @@ from app.api.http.responses import (
     page_response,
     wants_job,
 )
-from app.api.http.strict_json import StrictRoute
+from app.api.http.routes import Router
 from app.api.jobs import queued_job
 from app.api.markers.searches import Filtered, check_measures
 from app.api.surveys.schemas import DECLARATION_EXAMPLE, DeclarationIn
@@ -46,7 +47,7 @@ from app.services.surveys.imports import Imports as ImportsService
 # === /v1/imports: surveys come in.
 
 
-import_router = APIRouter(prefix="/v1/imports", tags=["imports"], route_class=StrictRoute)
+import_router = Router("/v1/imports", "imports")
 
 MAX_DECLARATION_BYTES = 64 * 1024
 _CURE = "send multipart/form-data with the parts file and declaration"
@@ -107,6 +108,8 @@ Jobs = Annotated[ImportJobs, use_case(lambda cases: cases.import_jobs)]
 
 @import_router.post(
     "",
+    SURVEYORS,
+    expensive=True,
     status_code=201,
     openapi_extra=_BODY,
     responses={
@@ -141,7 +144,7 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
     return created_response(report, replayed, status=200 if report["dry_run"] else 201)
 
 
-@import_router.get("", responses=document_response(ImportJobPage))
+@import_router.get("", SURVEYORS, responses=document_response(ImportJobPage))
 def list_imports(
     request: Request,
     caller: Caller,
@@ -158,7 +161,7 @@ def list_imports(
     return page_response(request, page, after=last)
 
 
-@import_router.get("/{import_id}", responses=document_response(ImportJobDocument, 404))
+@import_router.get("/{import_id}", SURVEYORS, responses=document_response(ImportJobDocument, 404))
 def get_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
     """Get an import that was queued.
 
@@ -167,7 +170,7 @@ def get_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
     return json_response(jobs.get(caller, import_id))
 
 
-@import_router.post("/{import_id}/cancel", responses=document_response(ImportJobDocument, 404, 409))
+@import_router.post("/{import_id}/cancel", SURVEYORS, responses=document_response(ImportJobDocument, 404, 409))
 def cancel_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
     """Cancel an import.
 
@@ -193,7 +196,7 @@ def _refused(request: Request, report: ImportReport) -> Response:
 # === /v1/exports: markers as files.
 
 
-export_router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=StrictRoute)
+export_router = Router("/v1/exports", "exports")
 
 ExportFormat = Literal["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"]
 _Measure = Annotated[float, Field(strict=True, ge=-1e8, le=1e8, allow_inf_nan=False)]
@@ -227,6 +230,7 @@ class ExportIn(StrictModel):
 
 @export_router.post(
     "",
+    READERS,
     status_code=202,
     responses=document_response(JobDocument, status=202, description="Queued; Location leads to its progress"),
 )
@@ -245,6 +249,8 @@ def post_export(
 
 @export_router.get(
     "/{kind}",
+    READERS,
+    expensive=True,
     responses={
         **file_response(media.partition(";")[0] for media in (STREAMED | WHOLE).values()),
         **problem_responses(),

@@ -9,12 +9,11 @@ import httpx
 import pytest
 import sqlalchemy as sa
 
-from app.api.http.permissions import PERMISSIONS
 from app.registry.agencies import agencies, idempotency_keys
 from app.registry.engines import across_agencies
 from app.services.access.access import Scope
 from tests.conftest import LiveServer
-from tests.http import refused
+from tests.http import PERMISSIONS, refused
 
 pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 

@@ -10,15 +10,11 @@ from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import pytest
-from fastapi.routing import APIRoute
 from starlette.types import Message
 
-from app.api.http.limits import EXPENSIVE, MAX_WAITING, Budget, RateLimit, Slots, admitted, bounded
-from app.api.http.permissions import PERMISSIONS
-from app.api.http.strict_json import StrictRoute
+from app.api.http.limits import MAX_WAITING, Budget, RateLimit, Slots, admitted, bounded
 from app.errors import ClientLeft, TooManyRequests, Unavailable
 from app.jobs.pool import Pending
-from app.main import ROUTERS
 from app.registry.database import Database
 from app.services.access.access import Caller, Scope
 from app.services.request_work import RequestWork, check_deadline, counted_steps, working
@@ -45,14 +41,6 @@ def _spin(processor_s: float = 0.02) -> None:
 
 
 # --- slots --------------------------------------------------------------------------------------------------------
-
-
-def test_every_route_is_bounded_and_every_expensive_one_exists() -> None:
-    routes = [route for router in ROUTERS for route in router.routes]
-    assert all(isinstance(route, StrictRoute) for route in routes)
-    names = {f"{method} {r.path}" for r in routes if isinstance(r, APIRoute) for method in r.methods}
-    assert names >= EXPENSIVE
-    assert PERMISSIONS.keys() >= EXPENSIVE
 
 
 def test_an_agency_waits_for_its_own_requests_only() -> None:

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from app.api.http.permissions import ADMINS, PERMISSIONS
+from app.api.http.permissions import ADMINS
 from app.published_settings import server_settings_of
 from app.services.access.access import Scope
 from app.settings import Settings
 from tests.conftest import LiveServer
+from tests.http import PERMISSIONS
 
 SECRETS = ("s3cret", "hidden-user", "hidden-host", "hidden-bucket", "hidden-folder", "hidden-client")
 
