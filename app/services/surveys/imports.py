@@ -358,9 +358,15 @@ class _Import:
                 part = codes.of(slice(start, start + _PART))
                 ids = new_ids(now, len(part.rows), number)
                 columns = marker_columns(
-                    self.survey, part, self.declaration, self.points, self.request.defaults,
-                    ids=ids, now=now, file_sha256=sha256,
-                )  # fmt: skip
+                    self.survey,
+                    part,
+                    self.declaration,
+                    self.points,
+                    self.request.defaults,
+                    ids=ids,
+                    now=now,
+                    file_sha256=sha256,
+                )
                 columns = self._with_measures(connection, columns)
                 store.add_markers(connection, entry, columns, kind=kind_of_new, why=why)
                 count += columns.count
@@ -418,9 +424,14 @@ class _Import:
             tolerance_m = self.declaration.tolerance_m
             comparison = comparison_document(prepared.comparison, self.survey, prepared.known, tolerance_m)
         return import_report(
-            outcome, self.request, self.survey,
-            good_rows=self.good_rows(), stored=stored, local_grid=self.grid, comparison=comparison,
-        )  # fmt: skip
+            outcome,
+            self.request,
+            self.survey,
+            good_rows=self.good_rows(),
+            stored=stored,
+            local_grid=self.grid,
+            comparison=comparison,
+        )
 
 
 _KEPT_BY_RESURVEY = ("family", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")
