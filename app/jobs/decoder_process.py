@@ -26,7 +26,7 @@ import numpy as np
 
 from app.errors import ProcessStopped, WaymarkError
 from app.markers.plate import PlateCode
-from app.services.decoder_tasks import decoder_task, out_of_memory, ran_short
+from app.services.decoder_tasks import out_of_memory, ran_short
 from app.services.decodes.frame_tasks import DecodePlates, use_decoder
 
 # === What the kernel keeps a decoder process from: memory, files, processor time, the network, other folders' files.
@@ -266,7 +266,6 @@ def keep_memory() -> None:
         mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
-@decoder_task("nothing", "try again", is_long=False)
 def process_id() -> int:
     """Id of the process: the answer shows that it is ready."""
     return os.getpid()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 import threading
 import time
@@ -206,7 +207,7 @@ def test_the_processor_time_of_threads_and_streams_is_counted() -> None:
 
 def test_a_task_of_a_client_that_left_is_cancelled() -> None:
     interrupted: list[object] = []
-    pending: Pending[int] = Pending(int, (), interrupted.append, 60.0)
+    pending: Pending[int] = Pending(os.getpid, (), interrupted.append, 60.0)
     assert pending.future.set_running_or_notify_cancel()
     pending.used_s = 1.5
     with working(60.0) as work:

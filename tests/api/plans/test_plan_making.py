@@ -70,7 +70,7 @@ def test_a_job_that_is_run_twice_makes_one_plan(
     processes = plans._processes
 
     class Stopping:
-        def submit(self, task: Any, *, wait_s: float = 0.0) -> Any:
+        def run(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
             raise Unavailable("the server stops")
 
     monkeypatch.setattr(plans, "_processes", Stopping())

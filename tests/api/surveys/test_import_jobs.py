@@ -114,10 +114,10 @@ def test_one_that_runs_stops_before_it_stores(
     processes, asked = server.app.state.use_cases.imports._processes, []
 
     class Slow:
-        def submit(self, task: Any, *, wait_s: float = 0.0) -> Any:
-            pending = processes.submit(task, wait_s=wait_s)
+        def run(self, task: Any, *arguments: Any, wait_s: float = 0.0) -> Any:
+            pending = processes.submit(task, *arguments, wait_s=wait_s)
             asked.append(_cancel(client, job["id"]))
-            return pending
+            return pending.result()
 
     monkeypatch.setattr(server.app.state.use_cases.imports, "_processes", Slow())
     server.app.state.use_cases.jobs.run_job(job["id"])
