@@ -22,6 +22,7 @@ from app.main import create_app
 from app.services.access.access import Scope
 from app.services.decodes import frames as archive_handler
 from app.services.decodes import frames as frame_runs
+from app.services.decodes.upload_path import Upload
 from app.settings import Settings
 from tests.api.decodes.conftest import near
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
@@ -143,18 +144,18 @@ def test_a_running_decode_shows_its_result_so_far(
 ) -> None:
     monkeypatch.setattr(archive_handler, "PART_EVERY", timedelta(0))
     monkeypatch.setattr(frame_runs, "RUN_FRAMES", 1)
-    decodes, seen, steps = server.app.state.use_cases.decodes, [], []
-    keep_part = decodes._keep_part
+    decodes, report, seen, steps = server.app.state.use_cases.decodes, Upload.report, [], []
     handler = next(handler for handler in decodes._handlers if handler.kind == "archive")
     monkeypatch.setattr(handler, "_rules", replace(handler._rules, progress_every=timedelta(0)))
     with server.agency("partial", Scope.PLANNER) as client:
 
-        def keep_and_look(job: Any, done: int, total: int, part: Any) -> None:
-            keep_part(job, done, total, part)
-            steps.append((client.get(f"/v1/jobs/{job.row.id}").json()["done"], total))
-            seen.append(client.get(f"/v1/decodes/{job.row.id}").json())
+        def report_and_look(upload: Upload, done: int, total: int, part: Any = None) -> None:
+            report(upload, done, total, part)
+            if part is not None:
+                steps.append((client.get(f"/v1/jobs/{upload.job.row.id}").json()["done"], total))
+                seen.append(client.get(f"/v1/decodes/{upload.job.row.id}").json())
 
-        monkeypatch.setattr(decodes, "_keep_part", keep_and_look)
+        monkeypatch.setattr(Upload, "report", report_and_look)
         answer = client.post("/v1/decodes", files={"file": archive(tmp_path / "drive.zip", 4).read_bytes()})
         assert answer.status_code == 202, answer.text
         path = answer.headers["location"]
