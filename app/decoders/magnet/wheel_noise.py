@@ -21,9 +21,9 @@ from app.compiled import kernel, routine
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Distances over which the filter learns, and limits of what a wheel can be like. Where no measurement stands beside a
-# value it was chosen in turns of some two metres. `python -m benchmarks.magnets` checks them: magnets that are found
-# beside wheels of all strengths, and the passes of METRO's section 7.2.
+# Distances over which the filter learns, in turns of some two metres, and limits of what a wheel can be like. They were
+# chosen where no measurement stands beside them. `python -m benchmarks.magnets wheel drawn` checks them: the passes of
+# METRO's section 7.2, and magnets that are found beside wheels of any strength.
 
 # Length of a turn.
 CIRCUMFERENCES_M = np.geomspace(1.6, 2.4, 64)
