@@ -235,7 +235,7 @@ def open_packed_video(file: SpooledFile, limits: ArchiveLimits) -> PackedVideo:
 CODECS = ("h264", "hevc", "mpeg4", "mjpeg")
 """Codecs that are decoded."""
 SEGMENT_S = 10.0
-"""[s] of a video that one task decodes. Source: chosen by hand: progress and cancelling every few seconds."""
+"""[s] of a video that one task decodes. Progress and cancelling every few seconds."""
 GAP_S, GAP_FACTOR = 1.0, 5.0
 """[s, 1] as in `app.services.decodes.frame_poses`."""
 MAX_RATE_HZ = 1000.0

@@ -57,7 +57,7 @@ from app.simulation.steering import SteeringCheck, check_steering
 
 
 _MOTION_STEP_S = 0.1  # [s] source: app/tracks/time_base.py has a node every 0.1 s
-_MOTION_VALUES = 36_000  # at most; source: by hand, an hour, 0.5 MB of JSON
+_MOTION_VALUES = 36_000  # at most; an hour, 0.5 MB of JSON
 
 # the drive that is decoded to compile the kernels
 _COMPILED_M, _COMPILED_M_S, _COMPILED_STEP_S, _COMPILED_CLEARANCE_M = 40.0, 12.0, 0.005, 0.2

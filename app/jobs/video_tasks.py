@@ -38,9 +38,9 @@ from app.services.decodes.tasks import (
 )
 
 OTHER_STEP = 3
-"""[frames] of which one is searched for markers of other families than plates. Source: chosen by hand, for speed."""
+"""[frames] of which one is searched for markers of other families than plates. For speed."""
 MAX_BEYOND = 45
-"""[frames] after a segment in which a plate that is in view at its end is followed. Source: chosen by hand."""
+"""[frames] after a segment in which a plate that is in view at its end is followed."""
 _VIDEO = ("video", "record at a lower resolution")
 
 

@@ -138,7 +138,7 @@ def variances(inverse: Floats, index: Ints, value: Floats) -> Floats:
 # === Centre, width and the vehicle's offset along a line, in one least-squares problem.
 
 
-KNOT_M = 3.0  # [m] between knots; source: by hand, sensitivity 0.95, 1.02
+KNOT_M = 3.0  # [m] between knots; sensitivity 0.95, 1.02
 _MIN_KNOTS = 5  # source: third differences need four
 _BAND = 9  # source: a third difference spans four knots of three fields: 3 x 3
 _LENGTH_SUM_SIGMA_M = 1e-3  # [m] of one step of the summed length; source: a 30th of `observations._LENGTH_SIGMA_M`
@@ -167,10 +167,10 @@ class Hyperparameters:
     wander_m: float = 0.2  # source: drivers keep 0.18 m RMS (`simulation.radio.driving.Driver`)
     wander_length_m: float = 30.0  # source: 2.5 s (`Driver.wander_time_s`) at 45 km/h
     drift: float = 0.0
-    slow_m: float = 3.0  # source: by hand, sensitivity 1.00, 1.00
+    slow_m: float = 3.0  # sensitivity 1.00, 1.00
     width_m: float = 3.3  # source: `LaneRules.usual_width_m`
-    width_sd_m: float = 0.25  # source: by hand, sensitivity 1.42, 0.96
-    width_length_m: float = 60.0  # source: by hand, sensitivity 1.03, 1.00
+    width_sd_m: float = 0.25  # sensitivity 1.42, 0.96
+    width_length_m: float = 60.0  # sensitivity 1.03, 1.00
     opens: bool = False
 
 
@@ -456,11 +456,11 @@ WIDTH_MODELS: tuple[WidthModel, ...] = (
     {"width_sd_m": 1.0, "width_length_m": 40.0, "opens": True},
     {"width_sd_m": 2.5, "width_length_m": 40.0, "opens": True},
 )  # fmt: skip
-"""Candidates for the width of a lane with two known sides: as painted, or with lanes that open and merge. Source: by
-hand, the roads of decision record 0016."""
+"""Candidates for the width of a lane with two known sides: as painted, or with lanes that open and merge. The roads of
+decision record 0016."""
 BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)
-"""Candidates for `Hyperparameters.bend`. Source: by hand, factors of two to three apart; the likelihood decides for
-each drive. [1/(m^2 sqrt(m))]"""
+"""Candidates for `Hyperparameters.bend`. Factors of two to three apart; the likelihood decides for each drive. [1/(m^2
+sqrt(m))]"""
 
 
 def choose_hyperparameters(

@@ -17,7 +17,7 @@ from app.registry.plan_states import BUILT, COMMITTED, SURVEYED
 from app.registry.spatial import Box
 from app.registry.tables import alignment_lanes, alignments, planned_markers, plans
 
-_PAGE = 200  # lanes that are read at a time; source: chosen by hand
+_PAGE = 200  # lanes that are read at a time
 _P = planned_markers.c
 
 

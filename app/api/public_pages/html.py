@@ -17,7 +17,7 @@ from app.api.public_pages.texts import LANGUAGES, Texts, is_public_page, texts_f
 from app.services.public_pages.pages import PublicMarker, ReportKind
 
 MAX_TEXT = 1000
-"""Characters of a description. Source: chosen by hand."""
+"""Characters of a description."""
 MAX_EMAIL = 254
 """Characters of an address (RFC 5321, section 4.5.3.1.3, without the angle brackets)."""
 

@@ -235,11 +235,11 @@ class SegmentResult:
 
 
 MAX_POINTS = 200_000
-"""Points of each series at most. Source: chosen by hand; 2 MB of JSON for a series."""
+"""Points of each series at most. 2 MB of JSON for a series."""
 MAX_SERIES = 6
 DEFAULT_SERIES = ("vertical", "forward")
 MAX_PACKETS = 20_000
-"""Packets that are listed at most. Source: chosen by hand; 2 MB of JSON."""
+"""Packets that are listed at most. 2 MB of JSON."""
 
 
 class SampleSeries(TypedDict):

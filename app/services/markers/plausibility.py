@@ -158,7 +158,7 @@ WarningMode: TypeAlias = Literal["store", "refuse"]
 """What warnings mean: the marker is stored, or refused."""
 _OF_SURVEYS = ("place_unchecked", "place_by_area_only", "beside_the_registered_line")
 """Faults that are evidence only in many rows: a single marker in a new place would always have one of them."""
-_MAX_NEIGHBOURS = 100  # registered markers that a position is compared with; chosen by hand
+_MAX_NEIGHBOURS = 100  # registered markers that a position is compared with
 
 
 def check_position(

@@ -58,7 +58,7 @@ from app.services.ports import Blobs, Clock, DecoderProcesses
 # === An approved plan becomes planned markers, in the caller's transaction and under one entry of the audit log.
 
 
-_PART = 2000  # rows that are stored at a time; source: chosen by hand, as imports
+_PART = 2000  # rows that are stored at a time; as imports
 
 
 def commit_markers(
@@ -154,11 +154,11 @@ def _extends(longer: Codebook, book: Codebook) -> bool:
 
 
 MAX_EXISTING = 200_000
-"""Markers of the registry near a road that a plan is checked against. Source: chosen by hand, bounds the memory."""
-_MARGIN_M = 100.0  # [m] around the road; source: chosen by hand, five times the distance of confusable codes
+"""Markers of the registry near a road that a plan is checked against. Bounds the memory."""
+_MARGIN_M = 100.0  # [m] around the road; five times the distance of confusable codes
 PLACED = 0.9
 """Progress of a job whose plan is placed and checked, and is stored next."""
-_TRIES = 4  # of drawing registry numbers that nobody has; source: chosen by hand
+_TRIES = 4  # of drawing registry numbers that nobody has
 
 
 @dataclass(frozen=True, slots=True)

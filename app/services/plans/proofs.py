@@ -41,8 +41,7 @@ from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue, Pending
 KeyT = TypeVar("KeyT")
 ResultT = TypeVar("ResultT")
 WAIT_S = 60.0
-"""How long a job waits for a place among the tasks of the decoder processes before it is put back. [s]
-Source: chosen by hand, as decodes."""
+"""How long a job waits for a place among the tasks of the decoder processes before it is put back. [s] As decodes."""
 
 
 def tasks_as_done(

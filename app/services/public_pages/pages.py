@@ -35,11 +35,11 @@ from app.services.ports import Clock, Task
 
 
 MIN_AGE_S = 3
-"""Nobody fills the form in faster. [s] Source: chosen by hand."""
+"""Nobody fills the form in faster. [s]"""
 MAX_AGE_S = 6 * 3600
-"""Time in which a form has to be sent. [s] Source: chosen by hand: photographed on the road, sent at home."""
+"""Time in which a form has to be sent. [s] Photographed on the road, sent at home."""
 _CLOCK_ERROR_S = 60
-"""How far the clocks of servers may differ. [s] Source: chosen by hand."""
+"""How far the clocks of servers may differ. [s]"""
 _PURPOSE = b"waymark damage report form 1"
 _TIME_BYTES, _NONCE_BYTES, _TAG_BYTES = 6, 12, 16
 
@@ -210,7 +210,7 @@ def contact_document(row: ContactRow) -> ReportContact:
 
 
 MAX_SIDE_PX = 2048
-"""Longest side of the stored photo. [px] Source: chosen by hand: damage is seen, and a photo takes 0.5 MB."""
+"""Longest side of the stored photo. [px] Damage is seen, and a photo takes 0.5 MB."""
 JPEG_QUALITY = 85
 
 

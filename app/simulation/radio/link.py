@@ -192,15 +192,15 @@ class Radio:
 
     spreading_factor: int = 7
     bandwidth_hz: int = 500_000
-    interval_s: float = 2.0  # [s] source: by hand, no measurement kept
-    jitter: float = 0.1  # source: by hand, no measurement kept
+    interval_s: float = 2.0  # [s]
+    jitter: float = 0.1
     payload_bytes: int = MESSAGE_BYTES
     preamble_symbols: int = 8
     lock_symbols: float = 5.0  # source: Bor et al. 2016, section 4
     capture_db: float = 6.0  # [dB] source: Bor et al. 2016, section 4
-    shadow_sd_db: float = 4.0  # [dB] source: assumed, no measurement kept
-    shadow_length_m: float = 25.0  # [m] source: assumed, no measurement kept
-    fading_sd_db: float = 2.0  # [dB] source: assumed, no measurement kept
+    shadow_sd_db: float = 4.0  # [dB] assumed
+    shadow_length_m: float = 25.0  # [m] assumed
+    fading_sd_db: float = 2.0  # [dB] assumed
     two_ray: TwoRay | None = None
     antenna_pattern: AntennaPattern | None = None
 
