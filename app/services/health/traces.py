@@ -38,7 +38,7 @@ from app.services.health.record import EVIDENCE, MISSED, rounded
 
 NEAR_M = 60.0
 """[m] from a marker, within which its packets are strong enough. Source: the CERPM paper, section 4.1: at most
-340 m, a sixth of it, so that only collisions lose packets."""
+340 m. A sixth of it, so that only collisions lose packets."""
 RECEIVED_SHARE = 0.7
 """Share of strong transmissions that are received. Source: 0.72 by ALOHA in `cerpm-radio` (docs/benchmarks.md)."""
 MAX_PROBABILITY = 0.97
