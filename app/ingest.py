@@ -97,7 +97,7 @@ class Spool:
 
 
 DEFAULT_TOPICS = ("application/+/device/+/event/up", "v3/+/devices/+/up")
-_MAX_TEXT_BYTES = 256 * 1024  # [byte] longest message that is stored; chosen by hand
+_MAX_TEXT_BYTES = 256 * 1024  # [byte] longest message that is stored
 _RETRY_S = (1.0, 60.0)
 _LOG = structlog.get_logger(__name__)
 

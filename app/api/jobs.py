@@ -53,7 +53,7 @@ from app.services.webhooks import (
 
 
 TICK_S = 0.5
-"""Time between two looks. [s] Source: chosen by hand; jobs report their progress about once a second."""
+"""Time between two looks. [s] Jobs report their progress about once a second."""
 WINDOW_S = 10.0
 """Time over which the rate of a job's steps is taken. [s]"""
 StateT = TypeVar("StateT")

@@ -179,7 +179,7 @@ def _bad_metadata(message: str) -> MalformedRequest:
 
 
 PIECE_BYTES = 16 << 20
-"""Bytes after which a piece is made durable. [byte] Source: chosen by hand; a killed server loses so much at most."""
+"""Bytes after which a piece is made durable. [byte] A killed server loses so much at most."""
 PIECE_S = 10.0
 """Time after which it is, however few bytes came; also the sign of life that keeps the lock. [s] Source: a third of
 `uploads.LOCK`."""

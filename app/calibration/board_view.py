@@ -18,29 +18,27 @@ Grey = npt.NDArray[np.uint8]
 
 MIN_CORNERS, MIN_SHARE = 8, 0.2
 """[corners, 1] of the board that a photo must show, the larger of both. Source: a view has six unknowns, a corner gives
-two equations; chosen by hand."""
+two equations."""
 MAX_EDGE_PX, EDGE_PHOTO_PX, MAX_EDGE_SHARE = 8.0, 2000, 0.25
 """[px, px, square] width of an edge above which a photo is blurred, on photos of this size (more on larger ones), and
-relative to a square, the smaller of both. Source: chosen by hand; commit `large photos may have wider edges`."""
+relative to a square, the smaller of both. Commit `large photos may have wider edges`."""
 SEARCH_PX = 2400
-"""[px] longer side to which photos are scaled down for the search; corners are refined at full size. Source: chosen by
-hand, for speed."""
+"""[px] longer side to which photos are scaled down for the search; corners are refined at full size. For speed."""
 MIN_PX = 64
-"""[px] least side of a photo in the search. Source: chosen by hand."""
+"""[px] least side of a photo in the search."""
 MIN_MARKERS = 4
-"""[markers] from which a mirrored or another board is recognised. Source: chosen by hand."""
+"""[markers] from which a mirrored or another board is recognised."""
 MAX_SHARPEST_PX = 10.0
 """[px] width of the sharpest edges above which a photo without a marker is blurred. Source: road photos have 4 to 8
 (commit `a photo of a road is not called blurred`)."""
 MIN_PHOTO_CONTRAST, MIN_BOARD_CONTRAST = 40, 10
-"""[grey levels] of a photo and of the board in it, below which the width of edges is not measured. Source: chosen by
-hand."""
+"""[grey levels] of a photo and of the board in it, below which the width of edges is not measured."""
 RANSAC_SHARE, MAX_MARKER_OFFSET, MIN_FITTING = 0.02, 0.5, 0.7
 """[extent of the markers, squares, 1] threshold of RANSAC, distance of a marker from its place up to which it fits, and
-the share of markers that must. Source: chosen by hand; a wide lens bends a board by less."""
+the share of markers that must. A wide lens bends a board by less."""
 FREE_SHARE, WINDOW_PX, MAX_CORNER_SHIFT = 0.8, (2, 12), 0.5
 """[1, px, 1] share of the space between corner and marker that the window of the refinement fills, limits of its half
-side, and the corner's shift as a share of that half side. Source: chosen by hand."""
+side, and the corner's shift as a share of that half side."""
 _OTHER_DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
 
 

@@ -24,15 +24,15 @@ COEFFICIENTS = (4, 5, 8)
 """Numbers of distortion coefficients: k1, k2, p1, p2; with k3; with k4, k5, k6. Source: OpenCV's models."""
 _NAMES = ("fx_px", "fy_px", "cx_px", "cy_px")
 _CELLS = (6, 8)
-"""[rows, columns] of cells over which coverage is counted. Source: chosen by hand."""
+"""[rows, columns] of cells over which coverage is counted."""
 _ROUNDS = 4
-"""[rounds] of fitting and leaving out views that do not fit, at most. Source: chosen by hand."""
+"""[rounds] of fitting and leaving out views that do not fit, at most."""
 MIN_COMMON_CORNERS = 4
-"""[corners] that two views must share to be compared. Source: chosen by hand."""
+"""[corners] that two views must share to be compared."""
 K3_SIGMA = 3.0
 """[standard deviations] above which k3 is kept. Source: the three-sigma rule."""
 MAX_MISFITS = 4
-"""[views] one in this many may be left out in one round. Source: chosen by hand."""
+"""[views] one in this many may be left out in one round."""
 MAX_TURN_BACK_PX = 0.5
 """[px] between a pixel and itself through the lens and back. Source: half a pixel."""
 

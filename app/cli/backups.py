@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 _PATIENCE_S = 3.0
-"""How long connections of servers that have just stopped are waited for. [s] Source: by hand."""
+"""How long connections of servers that have just stopped are waited for. [s]"""
 TargetArgument = Annotated[Path, typer.Argument(help="A new folder, or a new file that ends in .tar.")]
 KeysOption = Annotated[
     bool, typer.Option("--with-keys", help="Include the key files. Whoever has the backup then has the server's keys.")

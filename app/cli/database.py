@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _STORE_SECRETS = ("aws_access_key_id", "aws_secret_access_key")
 """Files of the folder of secrets that the client of S3 takes from the environment."""
 _NEAR = 0.88
-"""How similar a name is to a setting's (`difflib`). Source: by hand; WAYMARK_PROT is near, WAYMARK_KEY is not."""
+"""How similar a name is to a setting's (`difflib`). WAYMARK_PROT is near, WAYMARK_KEY is not."""
 
 
 def read_settings(**overrides: object) -> Settings:

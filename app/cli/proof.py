@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from app.planning.proof import ProofReport, ProofTerms
 
 _PLAN_FILE, _RESULTS_FILE = "plan.json", "proof-units.jsonl"
-_SHOWN_WEAK = 20  # rows of the table of weak markers; source: chosen by hand, a screen
+_SHOWN_WEAK = 20  # rows of the table of weak markers; a screen
 FolderArgument = Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder that `waymark plan` wrote.")]
 
 

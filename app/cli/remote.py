@@ -28,7 +28,7 @@ _BLOCK_BYTES = 256 * 1024
 _BUSY = (409, 423, 429, 503)
 """Answers after which the same upload goes on: another request is writing it, or the server is busy or starting."""
 _PAUSES_S = (0.2, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
-"""Pauses after interruptions in a row; after the last one the command gives up. Source: chosen by hand."""
+"""Pauses after interruptions in a row; after the last one the command gives up."""
 Check = Callable[["httpx.Response"], object]
 
 
@@ -154,7 +154,7 @@ _SERVER = "http://127.0.0.1:8000"
 _PART = 256 * 1024
 _RETRY_S = 1.0
 _SMALL_BYTES = 8 * 1024**2
-"""Larger files are sent so that the upload can go on after an interruption. [byte] Source: chosen by hand."""
+"""Larger files are sent so that the upload can go on after an interruption. [byte]"""
 
 
 def upload(

@@ -37,7 +37,7 @@ _BACKLOG = 2048
 """Connections that the kernel accepts before the server does. Source: default of uvicorn."""
 _MIN_CONNECTIONS = 8
 _ARENAS = 2
-"""Heaps that the threads share. Each keeps what its threads once used. Source: by hand, one for each of two cores."""
+"""Heaps that the threads share. Each keeps what its threads once used. One for each of two cores."""
 _M_ARENA_MAX = -8  # glibc's mallopt
 _NOT_STARTED = 3
 """Exit status; source: STARTUP_FAILURE of uvicorn."""

@@ -21,7 +21,7 @@ from app.registry.engines import across_agencies
 
 NAME = "control.sock"
 MAX_REQUEST_BYTES = 1024**2
-"""Largest request; files are passed as descriptors. [byte] Source: by hand, a declaration has at most 64 KiB."""
+"""Largest request; files are passed as descriptors. [byte] A declaration has at most 64 KiB."""
 MAX_FILES = 4
 
 
@@ -52,7 +52,7 @@ def receive_all(connection: socket.socket, limit: int) -> bytes:
 
 
 _PATIENCE_S = 20.0
-"""How long a server that starts or stops is waited for: it owns the database before it listens. [s] Source: by hand."""
+"""How long a server that starts or stops is waited for: it owns the database before it listens. [s]"""
 _AGAIN_S = 0.1
 _MAX_ANSWER_BYTES = 512 * 1024**2
 

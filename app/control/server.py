@@ -20,9 +20,9 @@ from app.errors import InvalidParameter, Unavailable, WaymarkError
 
 _LOG = structlog.get_logger("waymark.control")
 _REQUEST_S = 10.0
-"""Longest wait for a request that a client has begun. [s] Source: by hand; it comes from the same machine."""
+"""Longest wait for a request that a client has begun. [s] It comes from the same machine."""
 _CREDENTIALS = struct.Struct("3i")  # pid, uid, gid: unix(7), SO_PEERCRED
-_AT_ONCE = 4  # operations at a time; source: by hand
+_AT_ONCE = 4  # operations at a time
 _REPORT_EVERY_S = 0.2
 
 

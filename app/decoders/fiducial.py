@@ -1,4 +1,8 @@
-"""Frames -> readings of fiducial signs."""
+"""Frames -> readings of fiducial signs.
+
+A value without a source beside it is ours; tests/families/fiducial/test_fiducial_frames.py reads rendered
+frames with all of them.
+"""
 
 from __future__ import annotations
 
@@ -52,17 +56,13 @@ class FiducialReading:
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
 
-_CELL_PX = (
-    8  # [px] of a module in the rectified picture; its inner half is sampled; source: by hand, 16 samples a module
-)
-_NEXT_SQUARE = (
-    0.02  # [-] of the perimeter: a border inside the edge of its panel is a square of its own; source: by hand
-)
-_SAME_SQUARE = 0.1  # [-] candidates whose corners are nearer than this share of the side are one; chosen by hand
-_CLEAR_BORDER = 0.9  # [-] least share of the border's modules that are dark; chosen by hand
-_PROFILE_STEP_PX = 0.5  # [px] between samples across an edge; source: by hand, half a pixel
-_MIN_EDGE_POINTS = 5  # [-] of an edge, to fit a line; source: by hand, more than the two that define it
-_MIN_CONTRAST = 20.0  # [grey levels] of 255 between border and quiet zone; chosen by hand
+_CELL_PX = 8  # [px] of a module in the rectified picture; its inner half is sampled; 16 samples a module
+_NEXT_SQUARE = 0.02  # [-] of the perimeter: a border inside the edge of its panel is a square of its own
+_SAME_SQUARE = 0.1  # [-] candidates whose corners are nearer than this share of the side are one
+_CLEAR_BORDER = 0.9  # [-] least share of the border's modules that are dark
+_PROFILE_STEP_PX = 0.5  # [px] between samples across an edge; half a pixel
+_MIN_EDGE_POINTS = 5  # [-] of an edge, to fit a line; more than the two that define it
+_MIN_CONTRAST = 20.0  # [grey levels] of 255 between border and quiet zone
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,12 +197,12 @@ def _module_px(corners_px: Floats, n: int) -> float:
 Array = npt.NDArray[np.float64]
 
 CORNER_SIGMA_PX = 0.1
-"""Of a corner in each direction. [px] Source: chosen by hand; tests/families/fiducial/test_fiducial_frames.py prints
-0.035 on rendered frames, and the rest is left for lenses."""
+"""Of a corner in each direction. [px] The rest over 0.035 on rendered frames, as
+tests/families/fiducial/test_fiducial_frames.py prints it, is left for lenses."""
 TILT_SIGMA_RAD = math.radians(1.5)
-"""Of a sign's mounting and the vehicle's springs together; chosen by hand, no measurement kept. [rad]"""
+"""Of a sign's mounting and the vehicle's springs together. [rad]"""
 _STEP = 1e-6  # [m], [rad] for differences; source: the root of double precision, rounded up, for lengths of metres
-_ROUNDS = 10  # of Gauss-Newton; source: by hand, two or three suffice
+_ROUNDS = 10  # of Gauss-Newton; two or three suffice
 
 # axes of a plate (x right, y travel, z up) in the frame of an upright sign (x right, y up, z to the viewer)
 _SIGN_FROM_PLATE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -316,14 +316,14 @@ def _tilt(pose: Array, mounting: Mounting, camera: Camera) -> Array:
 
 VERSION = "fiducial/1"
 SURE = 0.99
-"""Least posterior probability at which a code is returned. Source: as of plates with check digits, chosen by hand."""
+"""Least posterior probability at which a code is returned. Source: as of plates with check digits."""
 DEFAULT_DICTIONARIES = ("apriltag-36h11", "aruco-mip-36h12", "aruco-6x6-250", "aruco-5x5-250", "apriltag-25h9")
 """Looked for besides the registered ones: dictionaries that are strong enough to be read without a registry."""
-_EXPECTED = 0.9  # [-] prior share of the registered signs nearby among the signs in view; chosen by hand
-_MIN_SPREAD = 0.1  # [-] of a module's darkness: blur and uneven print; chosen by hand
-_DAMAGED = 0.02  # [-] probability that a module shows nothing of its code: dirt, reflections; chosen by hand
-_MIN_SQUARES = 20  # [-] squares for each sign that a frame has at least, a priori; chosen by hand
-_CHANGE = 0.15  # [-] probability that neighbouring modules of a smooth pattern differ; chosen by hand
+_EXPECTED = 0.9  # [-] prior share of the registered signs nearby among the signs in view
+_MIN_SPREAD = 0.1  # [-] of a module's darkness: blur and uneven print
+_DAMAGED = 0.02  # [-] probability that a module shows nothing of its code: dirt, reflections
+_MIN_SQUARES = 20  # [-] squares for each sign that a frame has at least, a priori
+_CHANGE = 0.15  # [-] probability that neighbouring modules of a smooth pattern differ
 _WORTH_NAMING = 0.5  # [-] candidates whose best code is less likely are left out; source: more likely no sign than one
 
 

@@ -41,7 +41,7 @@ from app.markers.snapshot import Trust
 
 _GEOD = Geod(ellps="WGS84")
 _M_PER_DEG = 110_574.0  # [m] least length of a degree of latitude; source: WGS 84 at the equator
-_CLOCK_SLACK = timedelta(minutes=10)  # that a vehicle's clock may be slow; source: by hand
+_CLOCK_SLACK = timedelta(minutes=10)  # that a vehicle's clock may be slow
 _KM_H = {"km/h": 1.0, "mph": 1.609344}
 _CURE = "fetch the snapshot again"
 

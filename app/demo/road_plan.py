@@ -18,7 +18,7 @@ from app.errors import WaymarkError
 from app.planning.rules import read_rules
 
 ROAD, RULES = "e6.xodr", "e6-rules.yaml"
-ORIGIN_DEG = (12.0, 57.6)  # near the E6 in Sweden; source: by hand, the file's own system cannot be used
+ORIGIN_DEG = (12.0, 57.6)  # near the E6 in Sweden; the file's own system cannot be used
 TERMS = {"drives": 2, "seed": 7, "conditions": ["day", "wear"], "max_markers_per_drive": 4, "max_sections_per_drive": 1}
 FILES = ("report.md", "bill.csv", "schedule.csv", "drawings.pdf", "stakeout.gpkg", "plan.geojson", "cerpm-programs.csv")
 PATH_WITHIN_M = 0.1

@@ -178,7 +178,7 @@ def _tag(payload: bytes, key: bytes | None) -> str:
 
 
 SEQUENCE_AT = 16  # [bytes] first of the four bytes of the sequence; source: docs/cerpm-message.md
-MAX_PROGRAMS = 100_000  # source: by hand, bounds the size of a table
+MAX_PROGRAMS = 100_000  # bounds the size of a table
 COLUMNS = (
     "number", "lon_deg", "lat_deg", "height_m", "side", "speed_limit", "speed_unit", "body_hex", "sequence_start",
     "interval_s", "jitter_share", "frequency_hz", "channels", "hopping", "spreading_factor", "bandwidth_hz",

@@ -6,7 +6,7 @@ import hashlib
 import zipfile
 from typing import Any
 
-_LEVEL = 1  # of the compression; source: chosen by hand, for speed
+_LEVEL = 1  # of the compression; for speed
 
 
 class Packer:

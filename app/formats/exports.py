@@ -43,8 +43,8 @@ SHAPEFILE_NAMES = {
 }  # fmt: skip
 """Ten characters a name, the same in every file."""
 MAX_FROM_MERIDIAN_DEG = 9.0
-"""Farthest longitude from the central meridian of a zone that a marker is projected in. [deg] Source: by hand; a road
-of 6 degrees that begins in one zone lies in it whole."""
+"""Farthest longitude from the central meridian of a zone that a marker is projected in. [deg] A road of 6 degrees that
+begins in one zone lies in it whole."""
 
 
 class WrittenFile(NamedTuple):

@@ -22,7 +22,7 @@ from app.formats.text import DelimitedLog, decode_text, is_clean_text, is_text
 
 
 HEAD_BYTES = 1 << 16
-"""As much as detection of formats looks at. [byte] Source: chosen by hand."""
+"""As much as detection of formats looks at. [byte]"""
 _BLOCK_BYTES = 1 << 20
 
 
@@ -176,7 +176,7 @@ class Sample:
         return DelimitedLog.open(self.text)
 
 
-_START_CHARS = 1 << 16  # [character] chosen by hand
+_START_CHARS = 1 << 16  # [character]
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +226,7 @@ ZIP_MAGIC = b"PK\x03\x04"
 _EOCD = b"PK\x05\x06"
 _ZIP64_LOCATOR = b"PK\x06\x07"
 NAME_LENGTH = 120
-"""[character] of a name, without its folder. Chosen by hand."""
+"""[character] of a name, without its folder."""
 _ENCRYPTED = 0x1  # bit 0 of the flags; PKWARE APPNOTE, section 4.4.4
 _CHUNK = 1 << 16  # [byte] inflated at a time
 _TAIL_BYTES = 20 + 22 + 65535

@@ -24,7 +24,7 @@ FRAME_LISTS = ("frames.csv", "frames.json")
 TRACK_SUFFIXES, TRACKS = (".gpx", ".nmea", ".nma"), ("poses.csv", "track.csv")
 """Names of a track of the vehicle beside the frames."""
 MAX_LIST_BYTES = 4 * 1024**2
-"""[byte] chosen by hand: 40,000 rows of 100 characters."""
+"""[byte] 40,000 rows of 100 characters."""
 _NAMES = ("file", "file_name", "filename", "name", "frame", "image", "picture", "path")
 _ALIASES = {"file": _NAMES, **ALIASES}
 

@@ -32,7 +32,7 @@ _FOCAL_35MM = 0xA405
 _ASCII, _SHORT, _LONG = 2, 3, 4  # types of values
 _DATE = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)\Z")
 _OFFSET = re.compile(r"[+-]\d\d:\d\d\Z")
-_MAX_TEXT = 64  # [byte] chosen by hand; a date has 20
+_MAX_TEXT = 64  # [byte] a date has 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ _OTHER_SIGNATURES = (
     (b"<svg", "an SVG"),
     (b"<?xml", "an XML document"),
 )
-_MAX_SCANS = 64  # of a progressive JPEG; libjpeg writes about 10; chosen by hand
+_MAX_SCANS = 64  # of a progressive JPEG; libjpeg writes about 10
 _MIRRORED = (2, 4, 5, 7)
 _MARKER = re.compile(rb"\xff+[^\xff]", re.DOTALL)
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)

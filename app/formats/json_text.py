@@ -19,7 +19,7 @@ MAX_DEPTH = 32
 MAX_VALUES = 200_000
 """Values in one document. Source: a road of 1 MiB, the largest body, has 50,000 vertices of three values each."""
 MAX_MEMBERS = 1_000
-"""Members of one object. Source: chosen by hand, the largest that a route takes has about 40."""
+"""Members of one object. The largest that a route takes has about 40."""
 _MAX_INT = 2**64
 _MAX_INT_DIGITS = 20
 _SUSPECT = re.compile(rb"\\u(?:0000|[dD][89a-fA-F])|NaN|Infinity|\d{20}|[eE]\+?\d{3}")

@@ -27,7 +27,7 @@ FORMATS: tuple[Format[object], ...] = (
     *ALIGNMENT_FORMATS,
 )
 """Of equally likely formats the first is detected."""
-_SAMPLE_BYTES = 1 << 16  # [byte] chosen by hand; as much as `open_parts` reads of each file at first
+_SAMPLE_BYTES = 1 << 16  # [byte] as much as `open_parts` reads of each file at first
 _POSE_SUFFIXES = (".gpx", ".nmea", ".nma")
 
 

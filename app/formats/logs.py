@@ -14,7 +14,7 @@ from app.errors import InvalidParameter
 
 
 MAX_LISTED = 200
-"""Entries and warnings beyond this number are only counted. Chosen by hand."""
+"""Entries and warnings beyond this number are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ _LEAP_SECONDS = (
 _EARLIEST_S, _LATEST_S = 946_684_800.0, 4_102_444_800.0  # [s] the years 2000 to 2100
 _LEAP_SECOND = re.compile(r"(:\d\d):60(?=\D|$)")
 _NUMBER = re.compile(r"[+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d{1,2})?\Z")
-_MAX_TEXT = 64  # [character] longest time that is read; chosen by hand
+_MAX_TEXT = 64  # [character] longest time that is read
 NOWHEN = math.nan
 
 

@@ -131,8 +131,8 @@ def too_many_points(name: str, limits: PoseLimits) -> UploadTooLarge:
 Floats = npt.NDArray[np.float64]
 
 FASTEST_M_S = 150.0
-"""A point that can only be reached faster than this, from both sides, is an outlier. [m/s] Chosen by hand: 540 km/h."""
-_SLACK_M = 30.0  # [m] jump of a receiver that is no outlier; chosen by hand
+"""A point that can only be reached faster than this, from both sides, is an outlier. [m/s] 540 km/h."""
+_SLACK_M = 30.0  # [m] jump of a receiver that is no outlier
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
 
@@ -285,7 +285,7 @@ def _point_of(entry: int, cells: list[str], places: Mapping[str, int], clock: Lo
 # === Tracks as GPX 1.0 and 1.1.
 
 
-_HEAD_CHARS = 1 << 14  # [character] in which the root element stands; chosen by hand
+_HEAD_CHARS = 1 << 14  # [character] in which the root element stands
 
 
 def is_gpx(text: str) -> bool:
@@ -359,7 +359,7 @@ _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),([^*$\r\n]{0,200})(?:\*([0-9A-Fa
 _POSITIONS = ("RMC", "GGA", "GNS", "GLL")
 _READ = (*_POSITIONS, "VTG", "HDT", "THS", "GST", "ZDA", "DTM")
 _MIN_SPEED_KN = 2.0
-"""Below this speed the course over ground is noise, not the heading. [kn] Chosen by hand."""
+"""Below this speed the course over ground is noise, not the heading. [kn]"""
 _HALF_DAY = timedelta(hours=12)
 
 

@@ -20,12 +20,12 @@ import numpy.typing as npt
 from app.errors import InvalidParameter, UnreadableUpload
 
 MAX_LINE = 1 << 18
-"""Longest line that is read; longer ones are left out. [character] Chosen by hand; no measurement kept."""
+"""Longest line that is read; longer ones are left out. [character]"""
 MAX_NAME = 120
-"""Longest name of a file or a column that is shown. [character] Chosen by hand."""
-_SAMPLE_BYTES = 4096  # [byte] by which text is recognized; chosen by hand
+"""Longest name of a file or a column that is shown. [character]"""
+_SAMPLE_BYTES = 4096  # [byte] by which text is recognized
 _DECODED_BYTES = 1 << 20  # [byte] checked at a time, to bound memory
-_MAX_CONTROL_SHARE = 0.02  # [1] of the sample; chosen by hand: a damaged line or two, far below random bytes (0.11)
+_MAX_CONTROL_SHARE = 0.02  # [1] of the sample: a damaged line or two, far below random bytes (0.11)
 _BOMS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -162,7 +162,7 @@ def numbered_lines(text: str) -> Iterator[tuple[int, str]]:
 # === Columns of a table by name: which column holds which quantity.
 
 
-_MAX_SHOWN = 24  # names listed in a message; chosen by hand
+_MAX_SHOWN = 24  # names listed in a message
 
 
 def normal_name(name: str) -> str:
@@ -232,13 +232,13 @@ Floats = npt.NDArray[np.float64]
 SPACES = "space"
 """The delimiter of rows whose cells are separated by any number of spaces and tabs."""
 MAX_CELL = 10_000
-"""Longest cell of `split_rows`. [character] Chosen by hand; no measurement kept."""
+"""Longest cell of `split_rows`. [character]"""
 _LOG_DELIMITERS = (",", ";", "\t", "|")
-_MAX_LOG_COLUMNS = 256  # chosen by hand
-_MAX_HEADER = 1 << 16  # [character] of a log; chosen by hand
-_MAX_NUMBER = 40  # [character] a float64 needs at most 24; chosen by hand
-_MAX_BLOCK_LINE = 1 << 20  # [byte] longest line of `read_numbers_by_block`; chosen by hand
-_MAX_JSON_NUMBER = 1e300  # [1] an integer of JSON may be too large for a float; chosen by hand
+_MAX_LOG_COLUMNS = 256
+_MAX_HEADER = 1 << 16  # [character] of a log
+_MAX_NUMBER = 40  # [character] a float64 needs at most 24
+_MAX_BLOCK_LINE = 1 << 20  # [byte] longest line of `read_numbers_by_block`
+_MAX_JSON_NUMBER = 1e300  # [1] an integer of JSON may be too large for a float
 _MISSING = frozenset(("", "nan", "null", "none", "-", "n/a", "na"))
 _NUMERIC = b"0123456789+-.eEnaNifI \r\n"
 _NUMPY_CALL = b"np.float"  # numpy 2 writes its scalars as np.float64(1.5); the closing bracket is in `removed`

@@ -9,12 +9,12 @@ from xml.parsers import expat
 from app.errors import UnreadableUpload, UploadTooLarge
 
 MAX_DEPTH = 100
-"""Levels of a document. Source: chosen by hand."""
+"""Levels of a document."""
 MAX_BYTES = 256 * 2**20
 MAX_ELEMENTS = 2_000_000
-"""Size of a document that is kept in memory as a tree. Source: chosen by hand; a tree of it takes about 1 GB."""
+"""Size of a document that is kept in memory as a tree. A tree of it takes about 1 GB."""
 MAX_NUMBER = 1e9
-"""Greatest number of a road file; it keeps cubes of polynomials finite. Source: by hand, 25 times the equator."""
+"""Greatest number of a road file; it keeps cubes of polynomials finite. 25 times the equator."""
 
 
 def check_xml(data: bytes, *, max_elements: int, cure: str) -> None:

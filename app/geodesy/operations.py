@@ -22,7 +22,7 @@ from app.geodesy.systems import best_effort, covers, named_system
 
 _ITRF2014_2D, _ITRF2014_3D = "EPSG:9000", "EPSG:7912"
 _TIMELY = ("t_epoch", "defmodel")
-_MAX_NAME = 200  # characters; source: by hand, a note has 500
+_MAX_NAME = 200  # characters; a note has 500
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,10 +82,10 @@ def worst_grade(grades: Iterable[LocalizationGrade]) -> LocalizationGrade:
 PLATE_FIXED_EPOCH = 2020.0
 """Epoch in the ITRF for which plate-fixed coordinates without an epoch are transformed. [decimal year]
 
-Any would do, because they do not change and the position is moved to the epoch of its use. Source: by hand.
+Any would do, because they do not change and the position is moved to the epoch of its use.
 """
 UNSTATED_YEARS = 10.0
-"""Age that coordinates without an epoch may have. [year] Source: by hand; ITRF2014 came out in 2016."""
+"""Age that coordinates without an epoch may have. [year] ITRF2014 came out in 2016."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ _EPSG_FORMS = (
 _CRS84_FORMS = ("OGC:CRS84", "URN:OGC:DEF:CRS:OGC:1.3:CRS84", "URN:OGC:DEF:CRS:OGC::CRS84")
 _CRS_RULE = "an EPSG code or OGC:CRS84"
 _CRS_CURE = "write EPSG:4326, EPSG:6318, urn:ogc:def:crs:EPSG::2326, ...; without a CRS the position is WGS 84"
-_OUTSIDE_DEG = 1.0  # [deg] margin about an area of use; source: by hand, 111 km
+_OUTSIDE_DEG = 1.0  # [deg] margin about an area of use; 111 km
 
 
 def normalize_crs(crs: str | None) -> str:

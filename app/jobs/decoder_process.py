@@ -37,7 +37,7 @@ _ROOM_BYTES = 2 * 1024**3
 """Address space beside the private memory: libraries, and the stacks of threads that never run. [byte] Source: a warm
 process has 1.0 GB of addresses and 0.3 GB of private memory (`/proc/PID/status`)."""
 _OPEN_FILES = 128
-"""Source: a warm process has 11 open; by hand."""
+"""Source: a warm process has 11 open."""
 _MORE_S = 5.0
 
 # Linux: prctl(2), seccomp(2), linux/audit.h, linux/filter.h

@@ -49,7 +49,7 @@ from app.services.request_work import add_processor_time, check_deadline, curren
 # === Places of tasks in the decoder processes or before them: no agency takes all of them from the others.
 
 
-_CERTAIN = 2  # places that an agency gets also where others hold all; source: by hand, one that runs and the next
+_CERTAIN = 2  # places that an agency gets also where others hold all; one that runs and the next
 
 
 class Places:

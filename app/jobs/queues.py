@@ -25,9 +25,9 @@ from app.services.request_work import counted, working
 
 ItemT = TypeVar("ItemT")
 _NO_AGENCY = ("", EVERY_AGENCY)  # work of the server itself
-_REMEMBERED = 10_000  # owners that are remembered; source: by hand, far above the agencies of a server
-_HALF_LIFE_S = 60.0  # after which half of what an owner used counts; source: by hand
-_LATELY_S = 3600.0  # in which an owner that was served counts as one of several; source: by hand
+_REMEMBERED = 10_000  # owners that are remembered; far above the agencies of a server
+_HALF_LIFE_S = 60.0  # after which half of what an owner used counts
+_LATELY_S = 3600.0  # in which an owner that was served counts as one of several
 
 
 @dataclass(slots=True)
@@ -161,8 +161,8 @@ class FairQueue(Generic[ItemT]):
 
 
 RESUBMIT_S = 5.0
-"""How often jobs are looked for that nobody has. Source: by hand; with the lease of a job it is the time until the job
-of a killed process runs again, 20 s at most."""
+"""How often jobs are looked for that nobody has. With the lease of a job it is the time until the job of a killed
+process runs again, 20 s at most."""
 _LOG = structlog.get_logger(__name__)
 
 
@@ -201,7 +201,7 @@ class Resubmission:
 
 _RETRY_S = 2.0
 ONLINE_THREADS = 4
-"""Agencies whose jobs of the queue `online` run at the same time. Source: by hand; the work is in decoder processes."""
+"""Agencies whose jobs of the queue `online` run at the same time. The work is in decoder processes."""
 
 
 class Runner(Protocol):

@@ -20,15 +20,15 @@ from app.errors import InvalidParameter
 Floats = npt.NDArray[np.float64]
 
 STEP_M = 0.25  # [m] between points of a followed path; source: 0.1 m driven a step at 36 km/h, 2 steps a point
-SHORTEST_M, LONGEST_M = 10.0, 100_000.0  # [m] of a path; source: by hand
+SHORTEST_M, LONGEST_M = 10.0, 100_000.0  # [m] of a path
 MAX_GAP_M = 25.0  # [m] between points of a path; source: two spacings of 40 ft, 24.4 m
-MAX_TURN_DEG = 40.0  # [deg] from one metre to the next; source: by hand, a car's tightest circle of 5 m turns by 11
+MAX_TURN_DEG = 40.0  # [deg] from one metre to the next; a car's tightest circle of 5 m turns by 11
 _TURN_OVER_M = 1.0  # [m] source: the stations of decoded paths
 _HEADING_OVER_M = 1.0  # [m] to both sides; source: the stations of decoded paths
-_CURVATURE_OVER_M = 3.0  # [m] to both sides; source: by hand, about a wheelbase
+_CURVATURE_OVER_M = 3.0  # [m] to both sides; about a wheelbase
 _SAME_POINT_M = 1e-6  # [m] source: below every accuracy, above rounding
-_MIN_SPEED_M_S = 1.0  # [m/s] slower is steered as at this speed, by which equation 4 divides; source: by hand
-_PIECES_BEHIND, _PIECES_AHEAD = 8, 40  # of the path that are searched: 2 m and 10 m; source: by hand
+_MIN_SPEED_M_S = 1.0  # [m/s] slower is steered as at this speed, by which equation 4 divides
+_PIECES_BEHIND, _PIECES_AHEAD = 8, 40  # of the path that are searched: 2 m and 10 m
 
 
 class Controller(StrEnum):
@@ -48,7 +48,7 @@ class SteeringSettings:
     """Assumptions and gains of a controller."""
 
     # [1/s] k of equations 4 and 5
-    gain_per_s: float = 1.0  # [1/s] source: by hand, `suited_to`
+    gain_per_s: float = 1.0  # [1/s] `suited_to`
     # [m] d_l of equation 5
     lookahead_m: float = 15.0  # [m] source: CERPM paper, section 2.3.2
     # `latency_s`, `lag_s`, `wheelbase_m`: of the vehicle, as assumed by the predictive controller. [s, s, m]
@@ -56,7 +56,7 @@ class SteeringSettings:
     lag_s: float = 0.10  # [s] source: `simulation.steering.Vehicle`
     wheelbase_m: float = 2.70  # [m] source: Kia Niro, the paper's car
     # [rad/(m s)] steering of the predictive controller per integrated cross-track error
-    integral_per_m_s: float = 0.06  # [rad/(m s)] source: by hand, no measurement kept
+    integral_per_m_s: float = 0.06  # [rad/(m s)]
 
     def __post_init__(self) -> None:
         for name, low, high in (

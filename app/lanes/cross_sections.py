@@ -16,10 +16,10 @@ from app.errors import InvalidParameter
 
 Floats = npt.NDArray[np.float64]
 
-WIDTH_M = (1.5, 12.0)  # [m] narrowest and widest lane; source: by hand, a cycle lane and a wide ramp
-MAX_LENGTH_M = 200_000.0  # [m] source: by hand, bounds the time of a cut
-MAX_POINTS = 1_000_000  # source: by hand, bounds the memory of a cut
-_STEPS = 12  # of the search for a normal's intersection; source: by hand, no measurement kept
+WIDTH_M = (1.5, 12.0)  # [m] narrowest and widest lane; a cycle lane and a wide ramp
+MAX_LENGTH_M = 200_000.0  # [m] bounds the time of a cut
+MAX_POINTS = 1_000_000  # bounds the memory of a cut
+_STEPS = 12  # of the search for a normal's intersection
 _MET_M = 1e-9  # [m] step with which the search has converged; source: far below a survey's accuracy
 _ROUNDS = 3  # source: below a millimetre on lanes with radii of 10 m and more (`cut_lane`)
 

@@ -42,11 +42,9 @@ _TRACK_APART = (
     "the vehicle's track does not run beside the path, so that nothing shows that the path is in its place: check the "
     "datum and the survey of the markers, and of the receiver"
 )
-_BEYOND_TRACK_M = 15.0  # [m] further past its ends a track is not used; source: by hand, sensitivity 1.00, 1.00
-_PRECISE_TRACK_M = (
-    0.1  # [m] noise of a track that shows sides by itself; source: by hand: between RTK and other receivers
-)
-_MAX_BESIDE_TRACK_M = 4.0  # [m] such sides are of markers at most a lane's width away; source: by hand
+_BEYOND_TRACK_M = 15.0  # [m] further past its ends a track is not used; sensitivity 1.00, 1.00
+_PRECISE_TRACK_M = 0.1  # [m] noise of a track that shows sides by itself; between RTK and other receivers
+_MAX_BESIDE_TRACK_M = 4.0  # [m] such sides are of markers at most a lane's width away
 
 
 def fit_lane(

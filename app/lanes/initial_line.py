@@ -12,13 +12,13 @@ from app.lanes.smooth_line import SmoothLine, left_normals, lengths_along, plane
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints
 from app.sensors.pose_track import PoseTrack
 
-_NEIGHBOURS = 10  # of each marker in the graph; source: by hand, sensitivity 1.00, 1.00
-_BEND = 0.002  # [1/(m^2 sqrt(m))] change of curvature over a metre; source: by hand, sensitivity 1.01, 0.97
+_NEIGHBOURS = 10  # of each marker in the graph; sensitivity 1.00, 1.00
+_BEND = 0.002  # [1/(m^2 sqrt(m))] change of curvature over a metre; sensitivity 1.01, 0.97
 _UNSIDED_SIGMA_M = 1.6  # [m] of markers about the centre before sides are known; source: half the usual width of 3.3 m
-_SIDED_SIGMA_M = 0.3  # [m] of markers moved to the centre; source: by hand, sensitivity 0.98, 1.01
-_MAX_BESIDE_M = 8.0  # [m] markers further from the line are not of this lane; source: by hand, sensitivity 1.00, 1.00
-_ROUNDS = 3  # of moving markers to the centre; source: by hand, sensitivity 1.00, 1.00
-_SINGLE_ROW_M = 0.4  # [m] median distance below which all markers are one row; source: by hand, sensitivity 1.00, 1.00
+_SIDED_SIGMA_M = 0.3  # [m] of markers moved to the centre; sensitivity 0.98, 1.01
+_MAX_BESIDE_M = 8.0  # [m] markers further from the line are not of this lane; sensitivity 1.00, 1.00
+_ROUNDS = 3  # of moving markers to the centre; sensitivity 1.00, 1.00
+_SINGLE_ROW_M = 0.4  # [m] median distance below which all markers are one row; sensitivity 1.00, 1.00
 _KNOT_M = 3.0  # [m] source: `least_squares.KNOT_M`
 _MIN_LENGTH_M = 2.0  # [m] source: shorter lines have fewer than two knots
 
@@ -145,22 +145,20 @@ def _smooth(points_m: Floats, station_m: Floats, sigma_m: float) -> SmoothLine |
 # === The vehicle's own track: an initial line along the lane, and measurements beside a line.
 
 
-_JERK_M_S3 = 1.5  # [m/s^3] of a car in a bend, over a second; source: by hand, sensitivity 1.00, 0.99
+_JERK_M_S3 = 1.5  # [m/s^3] of a car in a bend, over a second; sensitivity 1.00, 0.99
 _POINT_SPACING_M = 3.0  # [m] between points of the line; source: the knots of `least_squares.KNOT_M`
-_MAX_PAUSE_S = 5.0  # [s] longer pauses are shortened to this; source: by hand, no effect on moving vehicles
+_MAX_PAUSE_S = 5.0  # [s] longer pauses are shortened to this; no effect on moving vehicles
 _BIN_S = 0.2  # [s] fixes are averaged over this; source: 2.8 m at 50 km/h, about one bin a knot
 _WILD_SIGMAS = 6.0  # fixes further off are left out; source: six sigma, never by chance in a drive
-_MAX_WILD_SHARE = 0.3  # more wild fixes are not wild but the track's usual error; source: by hand, no measurement kept
+_MAX_WILD_SHARE = 0.3  # more wild fixes are not wild but the track's usual error
 _MIN_SIGMA_M = 0.02  # [m] source: RTK receivers, CERPM paper, section 2.2
 _NEAR_MARKERS_M = (
     1000.0  # [m] the track beyond is not used; source: several times the radio range of 340 m (paper, 4.1)
 )
-_FINE_TRACK_M = 0.25  # [m] below this noise, one fix a metre is enough; source: by hand, sensitivity 1.00, 1.00
-_SLOW_TO_WHITE = 0.1  # minimum noise over reported accuracy; source: by hand, sensitivity 1.00, 1.00
-_MAX_ACCURACY_M = 10.0  # [m] larger reported accuracies count as this; source: by hand, no measurement kept
-TRUSTED_TRACK_M = (
-    0.5  # [m] reported accuracy below which a track shows the side of a single row; source: by hand: a third of
-)
+_FINE_TRACK_M = 0.25  # [m] below this noise, one fix a metre is enough; sensitivity 1.00, 1.00
+_SLOW_TO_WHITE = 0.1  # minimum noise over reported accuracy; sensitivity 1.00, 1.00
+_MAX_ACCURACY_M = 10.0  # [m] larger reported accuracies count as this
+TRUSTED_TRACK_M = 0.5  # [m] reported accuracy below which a track shows the side of a single row; a third of
 # the 1.65 m from the centre to a boundary
 _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
 

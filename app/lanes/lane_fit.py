@@ -36,16 +36,16 @@ from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints, LaneRules
 # === Which boundary of the lane each marker stands on: the most likely course of the lane beside an initial line.
 
 
-_GRID_STEP_M = 0.2  # [m] between candidate offsets of the centre; source: by hand, sensitivity 1.00, 1.00
-_GRID_HALF_M = 7.0  # [m] largest candidate offset; source: by hand, sensitivity 1.39, 1.00
-_MARKER_SIGMA_M = 0.25  # [m] of a marker about a lane of constant width; source: by hand, sensitivity 1.00, 1.00
-_OUTLIER_COST = 12.0  # squared sigmas, for a marker on no boundary; source: by hand, sensitivity 1.00, 1.00
-_WRONG_SIDE_COST = 8.0  # squared sigmas, on the other side than sent; source: by hand, sensitivity 1.00, 1.00
-_TRACK_COST = 0.02  # [1/m^2] per marker: drivers stay in the lane; source: by hand, sensitivity 1.00, 1.00
-_CLEAR_BAND_M = 0.8  # [m] half width of a band of markers with an obvious side; source: by hand, sensitivity 1.00, 1.00
-_WIDTHS_M = (2.5, 2.8, 3.1, 3.4, 3.8, 4.3, 4.8, 5.3, 5.8, 6.3, 6.8, 7.3)  # [m] source: by hand: 8 ft to two lanes
-_USUAL_WIDTHS_M = (2.5, 4.3)  # [m] 8 to 14 ft; source: by hand about the 9 to 12 ft of AASHTO Green Book, 4.3
-_OPENING_COST = 5.0  # [1/m] of a width that changes, in squared sigmas; source: by hand
+_GRID_STEP_M = 0.2  # [m] between candidate offsets of the centre; sensitivity 1.00, 1.00
+_GRID_HALF_M = 7.0  # [m] largest candidate offset; sensitivity 1.39, 1.00
+_MARKER_SIGMA_M = 0.25  # [m] of a marker about a lane of constant width; sensitivity 1.00, 1.00
+_OUTLIER_COST = 12.0  # squared sigmas, for a marker on no boundary; sensitivity 1.00, 1.00
+_WRONG_SIDE_COST = 8.0  # squared sigmas, on the other side than sent; sensitivity 1.00, 1.00
+_TRACK_COST = 0.02  # [1/m^2] per marker: drivers stay in the lane; sensitivity 1.00, 1.00
+_CLEAR_BAND_M = 0.8  # [m] half width of a band of markers with an obvious side; sensitivity 1.00, 1.00
+_WIDTHS_M = (2.5, 2.8, 3.1, 3.4, 3.8, 4.3, 4.8, 5.3, 5.8, 6.3, 6.8, 7.3)  # [m] 8 ft to two lanes
+_USUAL_WIDTHS_M = (2.5, 4.3)  # [m] 8 to 14 ft; about the 9 to 12 ft of AASHTO Green Book, 4.3
+_OPENING_COST = 5.0  # [1/m] of a width that changes, in squared sigmas
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,34 +198,32 @@ def _cheapest_course(cost: Floats, grid: Floats, opening: Floats, reach_m2: Floa
 # === The lane along an initial line.
 
 
-_MAX_ROUNDS = 8  # of solving beside a line and moving the line; source: by hand, sensitivity 1.23, 0.93
-_CONVERGED_M = 0.1  # [m] a line that moves less is the centre; source: by hand, sensitivity 1.00, 1.18
-_NEARLY_CONVERGED_M = 0.5  # [m] a line that moved less shows no new outliers; source: by hand, sensitivity 1.00, 1.00
-_MAX_REJECTIONS = 12  # of outliers beside one line; source: by hand, sensitivity 1.00, 1.00
-_MAX_GROWTH = 2.0  # of the length of the initial line; more is a line that winds between outliers; source: by hand
-_REJECTION_STRETCH_M = 60.0  # [m] within it one outlier at a time; source: by hand, sensitivity 1.00, 1.00
+_MAX_ROUNDS = 8  # of solving beside a line and moving the line; sensitivity 1.23, 0.93
+_CONVERGED_M = 0.1  # [m] a line that moves less is the centre; sensitivity 1.00, 1.18
+_NEARLY_CONVERGED_M = 0.5  # [m] a line that moved less shows no new outliers; sensitivity 1.00, 1.00
+_MAX_REJECTIONS = 12  # of outliers beside one line; sensitivity 1.00, 1.00
+_MAX_GROWTH = 2.0  # of the length of the initial line; more is a line that winds between outliers
+_REJECTION_STRETCH_M = 60.0  # [m] within it one outlier at a time; sensitivity 1.00, 1.00
 _PAIR_SIGMAS = (
     5.0  # from which on a pair does not agree with the lane; source: decision 0016, 3 loses pairs of tight bends
 )
-_MIN_SLOPE_SHARE = 0.05  # of a pair's variance that others explain; source: by hand, keeps the division by it finite
-_SCATTERS = (1.6, 2.5, 4.0)  # of markers, in their stated accuracy; source: by hand: 3.5, 5.5, 9 cm for the usual 2.2
-_MIN_GAIN = 1.5  # of the log likelihood by a larger scatter; source: by hand, on scenes of `benchmarks.hunt cerpm`
-_STIFFER = 3  # bends that are tried with a scatter: the one found and stiffer ones; source: by hand
+_MIN_SLOPE_SHARE = 0.05  # of a pair's variance that others explain; keeps the division by it finite
+_SCATTERS = (1.6, 2.5, 4.0)  # of markers, in their stated accuracy; 3.5, 5.5, 9 cm for the usual 2.2
+_MIN_GAIN = 1.5  # of the log likelihood by a larger scatter; on scenes of `benchmarks.hunt cerpm`
+_STIFFER = 3  # bends that are tried with a scatter: the one found and stiffer ones
 _CONSTANT_WIDTH: Mapping[str, Any] = WIDTH_MODELS[0]
-_OPPOSITE_SHARE = (
-    0.2  # of sides that agree with the track, below which they are of the other direction; source: by hand
-)
-_MIN_SIDED_MARKERS = 4  # to compare sides with the track; source: by hand
-_SIDE_OFFSETS_M = (0.5, 4.0)  # [m] nearest and farthest offset at which a side is clear; source: by hand
+_OPPOSITE_SHARE = 0.2  # of sides that agree with the track, below which they are of the other direction
+_MIN_SIDED_MARKERS = 4  # to compare sides with the track
+_SIDE_OFFSETS_M = (0.5, 4.0)  # [m] nearest and farthest offset at which a side is clear
 _PRECISE_TRACK_M = 0.06  # [m] noise of an RTK track; source: three times `initial_line._MIN_SIGMA_M`
-_PRECISE_WANDER, _COARSE_WANDER = 0.06, 0.2  # [m/sqrt(m)] of the centre; source: by hand, sensitivity 1.00, 1.00
-_UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; source: by hand: a receiver without corrections
+_PRECISE_WANDER, _COARSE_WANDER = 0.06, 0.2  # [m/sqrt(m)] of the centre; sensitivity 1.00, 1.00
+_UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; a receiver without corrections
 _SINGLE_SIDE_DRIFTS = (0.05, 0.15, 0.4)  # [m/sqrt(m)] source: the receivers of `least_squares.OFFSET_MODELS`
 _FIX_SIGMAS, _MIN_FIX_REACH_M = (
     8.0,
     6.0,
-)  # [1, m] fixes further from the track's median offset are not used; source: by hand
-_UNKNOWN_WIDTH = Hyperparameters(width_sd_m=0.4, width_length_m=400.0)  # of a lane with one known side; source: by hand
+)  # [1, m] fixes further from the track's median offset are not used
+_UNKNOWN_WIDTH = Hyperparameters(width_sd_m=0.4, width_length_m=400.0)  # of a lane with one known side
 
 
 class FixOffsets(NamedTuple):

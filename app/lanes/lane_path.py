@@ -22,16 +22,12 @@ from app.lanes.smooth_line import (
 from app.lanes.types import UNKNOWN, Bools, Floats, Ints, Lane, LaneRules, LeftOutReason, Notes, TrackAgreement
 from app.sensors.pose_track import PoseTrack
 
-_MAX_WIDTH_SIGMA_M = (
-    0.3  # [m] a width that is less certain is not published; source: by hand: an eighth of narrow lanes
-)
-_MAX_BOUNDARY_SIGMA_M = 0.4  # [m] a boundary that is less certain is not published; source: by hand
-_SAME_STATION_M = (
-    3.0  # [m] speed limits closer along the path must agree; source: by hand: a quarter of the paper's 12.2 m
-)
-_MIN_OTHER_ROW = 3  # outliers that may be a row that the path should follow; source: by hand, two may be chance
-_OTHER_ROW_REACH_M, _OTHER_ROW_SPACINGS = 40.0, 3.0  # [m, 1] within which so many are close together; source: by hand
-_OTHER_ROW_SIGMA_M = 0.6  # [m] added then; source: by hand: the path's confidence falls below one half
+_MAX_WIDTH_SIGMA_M = 0.3  # [m] a width that is less certain is not published; an eighth of narrow lanes
+_MAX_BOUNDARY_SIGMA_M = 0.4  # [m] a boundary that is less certain is not published
+_SAME_STATION_M = 3.0  # [m] speed limits closer along the path must agree; a quarter of the paper's 12.2 m
+_MIN_OTHER_ROW = 3  # outliers that may be a row that the path should follow; two may be chance
+_OTHER_ROW_REACH_M, _OTHER_ROW_SPACINGS = 40.0, 3.0  # [m, 1] within which so many are close together
+_OTHER_ROW_SIGMA_M = 0.6  # [m] added then; the path's confidence falls below one half
 _MIN_SIGMA_M = 1e-6  # [m] keeps the confidence finite; source: below every survey, above rounding
 _TAIL_FREEDOM, _TAIL_SCALE = 2.4, 0.61
 """Degrees of freedom and scale, in standard deviations, of the distribution of errors. Source: maximum likelihood of
@@ -231,22 +227,22 @@ def _by_row(fit: LaneFit, observations: LaneObservations) -> tuple[Ints, Floats]
 
 
 _SPACING_M = 3.0  # [m] between fixes that are compared; source: `initial_line._POINT_SPACING_M`
-_MAX_STEPS = 5000  # of the track, longer steps on tracks above 15 km; source: by hand, bounds the time
-_MIN_FIXES, _MIN_LENGTH_M = 10, 30.0  # fixes, and the length of track, without which nothing is compared; by hand
-_MAX_BESIDE_M = 500.0  # [m] fixes further from the path are of another road; source: by hand, above a datum's shift
+_MAX_STEPS = 5000  # of the track, longer steps on tracks above 15 km; bounds the time
+_MIN_FIXES, _MIN_LENGTH_M = 10, 30.0  # fixes, and the length of track, without which nothing is compared
+_MAX_BESIDE_M = 500.0  # [m] fixes further from the path are of another road; above a datum's shift
 _APART_M = (
     20.0  # [m] short tracks with a fix closer than this are beside the path; source: four times a poor receiver's 5 m
 )
-_OFFSET_SD_M = 0.25  # [m] of a driver's usual offset; source: by hand, the upper bound of `benchmarks.hunt.cerpm`
+_OFFSET_SD_M = 0.25  # [m] of a driver's usual offset; the upper bound of `benchmarks.hunt.cerpm`
 _WANDER_SD_M, _WANDER_LENGTH_M = 0.25, 30.0  # [m, m] source: as above, and `least_squares.OFFSET_MODELS`
 _CUT_M2 = 2.0  # [m2] offset towards the inside of bends, per curvature; source: twice `Driver.cut_m2` of radio drives
-_SHIFT_SD_M, _TURN_SD, _SCALE_SD = 300.0, 0.2, 0.1  # [m, rad, 1] source: by hand, above any mistake that is searched
+_SHIFT_SD_M, _TURN_SD, _SCALE_SD = 300.0, 0.2, 0.1  # [m, rad, 1] above any mistake that is searched
 _UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none; source: `lane_fit._UNKNOWN_ACCURACY_M`
-_OPTIMISM = 1.5  # true error of a receiver over the accuracy that it reports; source: by hand
-_SLOW_SHARE = 0.3  # of a receiver's error that changes along the track like wander; source: by hand
-_ROUNDS = 12  # of finding the nearest places on the path; source: by hand, converged to a millimetre
+_OPTIMISM = 1.5  # true error of a receiver over the accuracy that it reports
+_SLOW_SHARE = 0.3  # of a receiver's error that changes along the track like wander
+_ROUNDS = 12  # of finding the nearest places on the path; converged to a millimetre
 _CONVERGED_M = 1e-3  # [m]
-_OUTLIER_SIGMAS = 3.0  # from which on a fix counts less (Huber); source: by hand
+_OUTLIER_SIGMAS = 3.0  # from which on a fix counts less (Huber)
 
 
 class _Compared(NamedTuple):

@@ -138,7 +138,7 @@ def variances(inverse: Floats, index: Ints, value: Floats) -> Floats:
 # === Centre, width and the vehicle's offset along a line, in one least-squares problem.
 
 
-KNOT_M = 3.0  # [m] between knots; source: by hand, sensitivity 0.95, 1.02
+KNOT_M = 3.0  # [m] between knots; sensitivity 0.95, 1.02
 _MIN_KNOTS = 5  # source: third differences need four
 _BAND = 9  # source: a third difference spans four knots of three fields: 3 x 3
 _LENGTH_SUM_SIGMA_M = 1e-3  # [m] of one step of the summed length; source: a 30th of `observations._LENGTH_SIGMA_M`
@@ -157,11 +157,11 @@ class Hyperparameters:
     # `drift`, `slow_m`: of the receiver's slow error, which replaces the wander if not 0: growth [m/sqrt(m)], and
     # size [m]
     drift: float = 0.0
-    slow_m: float = 3.0  # source: by hand, sensitivity 1.00, 1.00
+    slow_m: float = 3.0  # sensitivity 1.00, 1.00
     # `width_m`, `width_sd_m`, `width_length_m`: [m] of the lane's width: mean, standard deviation, correlation length
     width_m: float = 3.3  # source: `LaneRules.usual_width_m`
-    width_sd_m: float = 0.25  # source: by hand, sensitivity 1.42, 0.96
-    width_length_m: float = 60.0  # source: by hand, sensitivity 1.03, 1.00
+    width_sd_m: float = 0.25  # sensitivity 1.42, 0.96
+    width_length_m: float = 60.0  # sensitivity 1.03, 1.00
     opens: bool = False  # the width is Matern 3/2 noise, as of a lane that opens or merges over tapers
 
 
@@ -444,8 +444,8 @@ WIDTH_MODELS: tuple[WidthModel, ...] = (
 """Candidates for the width of a lane with two known sides: as painted, or with lanes that open and merge. Source: by
 hand, the roads of decision record 0016."""
 BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)
-"""Candidates for `Hyperparameters.bend`. Source: by hand, factors of two to three apart; the likelihood decides for
-each drive. [1/(m^2 sqrt(m))]"""
+"""Candidates for `Hyperparameters.bend`. Factors of two to three apart; the likelihood decides for each drive. [1/(m^2
+sqrt(m))]"""
 
 
 def choose_hyperparameters(

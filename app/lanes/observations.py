@@ -24,7 +24,7 @@ from app.lanes.types import (
 
 _USUAL_SIGMA_M = 0.02  # [m] source: the survey of the CERPM paper, section 2.2
 _MIN_SIGMA_M = 0.005  # [m] source: half the 1.1 cm steps of a message's degrees (`markers.cerpm.DEGREE_STEP`)
-_PLACING_SD_M = 0.01  # [m] of a marker about its boundary; source: by hand, as `simulation.radio.markers`
+_PLACING_SD_M = 0.01  # [m] of a marker about its boundary; as `simulation.radio.markers`
 _SAME_POINT_DECIMALS = 2  # source: a centimetre, the steps of a message's degrees
 _NO_SIDE = 9  # source: above every `LaneSide`
 
@@ -135,12 +135,12 @@ class Pairs(NamedTuple):
     cautious_sigma: Floats
 
 
-_MIN_PAIRS = 4  # source: by hand, sensitivity 1.00, 1.00
-_MIN_PAIRED_SHARE = 0.7  # of mutual neighbours that stand close together; source: by hand, sensitivity 1.00, 3.17
+_MIN_PAIRS = 4  # sensitivity 1.00, 1.00
+_MIN_PAIRED_SHARE = 0.7  # of mutual neighbours that stand close together; sensitivity 1.00, 3.17
 _MAX_STAGGER_SHARE = 0.12  # of the spacing; source: by chance 2 x 0.12, one in four, are as close
 _PLACING_SIGMA_M = 0.012  # [m] of placing by hand; source: `simulation.radio.markers._PLACING_SD_M` on two axes
 _MAX_STAGGER_M = 4.0  # [m] source: a third of the paper's spacing of 12.2 m (40 ft)
-_MIN_ROW_STAGGER_M = 0.1  # [m] of one row ahead of the other; source: by hand, sensitivity 1.00, 1.00
+_MIN_ROW_STAGGER_M = 0.1  # [m] of one row ahead of the other; sensitivity 1.00, 1.00
 _ROW_STAGGER_Z = 3.0  # and by this many standard errors; source: three sigma, one false alarm in 370
 _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
 _NEIGHBOURS = 5  # pairs that a pair is compared with, itself included; source: two of five may be wrong
@@ -219,21 +219,21 @@ def nearest_sorted(sorted_m: Floats, wanted_m: Floats) -> Ints:
 # the next one too long by as much: their lengths are not used.
 
 
-_SAME_STATION_M = 1.5  # [m] markers closer along the lane count once; source: by hand, sensitivity 1.00, 1.00
-_MIN_SPACING_M = 20.0  # [m] closer markers show the bend by their positions; source: by hand, sensitivity 1.00, 1.02
-_TURN_SIGMA_M = 0.5  # [m/rad^2] error of a bend's length; source: by hand, sensitivity 1.02, 0.97
-_MIN_LENGTHS = 3  # source: by hand, sensitivity 1.00, 1.00
-_MIN_EVEN_SHARE = 0.8  # of the lengths; source: by hand, sensitivity 1.29, 1.29
-_EVEN_M = 0.2  # [m] a length this close to a multiple is even; source: by hand, sensitivity 0.98, 1.02
+_SAME_STATION_M = 1.5  # [m] markers closer along the lane count once; sensitivity 1.00, 1.00
+_MIN_SPACING_M = 20.0  # [m] closer markers show the bend by their positions; sensitivity 1.00, 1.02
+_TURN_SIGMA_M = 0.5  # [m/rad^2] error of a bend's length; sensitivity 1.02, 0.97
+_MIN_LENGTHS = 3  # sensitivity 1.00, 1.00
+_MIN_EVEN_SHARE = 0.8  # of the lengths; sensitivity 1.29, 1.29
+_EVEN_M = 0.2  # [m] a length this close to a multiple is even; sensitivity 0.98, 1.02
 _LENGTH_SIGMA_M = 0.03  # [m] of a known length; source: survey of 0.02 m and placing of 0.01 m at both ends
-_MAX_SPACINGS = 4  # between two markers: three missing in between; source: by hand, sensitivity 1.00, 1.00
-_MAX_EXCESS_SHARE = 0.1  # of the distance; source: by hand, sensitivity 1.00, 1.00
+_MAX_SPACINGS = 4  # between two markers: three missing in between; sensitivity 1.00, 1.00
+_MAX_EXCESS_SHARE = 0.1  # of the distance; sensitivity 1.00, 1.00
 _MOVED_M = (
     0.1  # [m] opposite errors of neighbouring lengths above this show a moved pair; source: 3 x `_LENGTH_SIGMA_M`
 )
 _SHORT_M = 40.0  # [m] on longer stretches bends make opposite errors too; source: decision 0016, rows of ten a side
 _CANCEL_SHARE = 0.3  # of the errors, which their sum must be below on longer stretches; source: as above
-_CLEARLY_BETTER = 0.5  # of the squared misfit along the second best line; source: by hand, sensitivity 0.93, 1.28
+_CLEARLY_BETTER = 0.5  # of the squared misfit along the second best line; sensitivity 0.93, 1.28
 
 
 @dataclass(frozen=True, slots=True, eq=False)

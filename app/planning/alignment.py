@@ -19,7 +19,7 @@ from app.geodesy import LocalizationGrade, check_lon_lat, grade_accuracy
 
 
 MAX_EPOCH = (1900.0, 2100.0)
-"""Plausible coordinate epochs. [decimal year] Source: chosen by hand."""
+"""Plausible coordinate epochs. [decimal year]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class AlignmentDeclaration:
 Floats = npt.NDArray[np.float64]
 
 STEP_M = 1.0
-"""Greatest distance between samples of a lane. [m] Source: chosen by hand; the sagitta at 20 m radius is 6 mm."""
+"""Greatest distance between samples of a lane. [m] The sagitta at 20 m radius is 6 mm."""
 _GEOD = Geod(ellps="WGS84")
 
 

@@ -31,8 +31,8 @@ from app.planning.rules import RoadRules
 Floats = npt.NDArray[np.float64]
 
 MIN_LANE_M = 5.0
-"""Shorter lanes get no markers. [m] Source: issue 13, chosen by hand; a plate's spacing is at least 5 m."""
-_SHOWN = 10  # names of lanes in a message; source: chosen by hand
+"""Shorter lanes get no markers. [m] Source: issue 13; a plate's spacing is at least 5 m."""
+_SHOWN = 10  # names of lanes in a message
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,9 +15,9 @@ from app.markers.cerpm import LaneSide
 Floats = npt.NDArray[np.float64]
 
 SPACING_M = 12.192  # [m] 40 ft; source: the cycle N of a broken line, MUTCD 2009 section 3B.11, and the CERPM paper
-MIN_SPACING_M = 1.0  # [m] source: by hand
-SAGITTA_M = 0.15  # [m] of a chord between neighbours, above which they are closer; source: by hand, no measurement kept
-MAX_PER_SIDE = 100_000  # source: by hand, 1,200 km at 40 ft
+MIN_SPACING_M = 1.0  # [m]
+SAGITTA_M = 0.15  # [m] of a chord between neighbours, above which they are closer
+MAX_PER_SIDE = 100_000  # 1,200 km at 40 ft
 _BEND_REACH_M = 6.0  # [m] before and after a bend; source: half the paper's spacing
 
 

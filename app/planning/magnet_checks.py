@@ -66,9 +66,9 @@ REACTION_S = 2.5
 DECELERATION_MPS2 = 3.4
 """Comfortable deceleration. [m/s2] Source: AASHTO Green Book (2018), section 3.2.2. By these two the 20 m before a stop
 line of METRO section 6.3 serve up to 5.9 m/s."""
-_SERVED = 0.95  # share of a kind of vehicle that must have a readable clearance; source: by hand
-_WANDER_M = 0.5  # [m] a vehicle wanders in its lane; source: by hand
-_TOLERANCE_M = 0.0005  # [m] rounding of positions; source: by hand
+_SERVED = 0.95  # share of a kind of vehicle that must have a readable clearance
+_WANDER_M = 0.5  # [m] a vehicle wanders in its lane
+_TOLERANCE_M = 0.0005  # [m] rounding of positions
 
 
 @dataclass(frozen=True, slots=True)

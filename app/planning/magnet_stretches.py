@@ -14,7 +14,7 @@ from app.roads.lane_line import LaneLine
 
 _EVEN_M = 0.005  # [m] difference of neighbouring distances in one line; source: a drill's tolerance, METRO section 8.2
 _MAX_LINE_M = 19_000.0  # [m] source: below `app.roads.lane_line.MAX_LENGTH_M`
-_BEFORE_M, _AFTER_M = 20.0, 40.0  # [m] of lane that is kept around a tag; source: chosen by hand, several tag lengths
+_BEFORE_M, _AFTER_M = 20.0, 40.0  # [m] of lane that is kept around a tag; several tag lengths
 _GEOD = Geod(ellps="WGS84")
 
 

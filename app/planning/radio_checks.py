@@ -39,10 +39,10 @@ from app.radio.settings import (
 
 CAMERA_PREVIEW_M = 31.0  # [m] of lane that a camera sees, beacons must give more; source: CERPM paper, section 5
 SPACING_M = 12.192  # [m] 40 ft; source: CERPM paper, section 3.2
-_SAMPLES = 60  # markers that are checked; source: by hand, bounds the time of a check
-_STATIONS = 200  # points of the road that are checked; source: by hand, bounds the time of a check
-_STATION_MARKERS = 2_000_000  # stations times markers; source: by hand, bounds the time of a check to seconds
-_STATION_STEP_M = 5.0  # [m] source: by hand, no measurement kept
+_SAMPLES = 60  # markers that are checked; bounds the time of a check
+_STATIONS = 200  # points of the road that are checked; bounds the time of a check
+_STATION_MARKERS = 2_000_000  # stations times markers; bounds the time of a check to seconds
+_STATION_STEP_M = 5.0  # [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,10 +278,10 @@ def _battery(plan: RadioPlan, days: float) -> RadioFinding:
 # === Recommended radio settings: a search for lawful settings under which markers are read in time.
 
 
-INTERVALS_S = tuple(float(f"{v:.2g}") for v in np.geomspace(0.1, 20.0, 16))  # [s] source: by hand, ratio of 1.42
-POWERS_DBM = (20.0, 17.0, 14.0, 11.0, 8.0)  # [dBm] source: by hand, halves of the SX1276's maximum
-MORE_CHANNELS = (2, 4, 8, 16, 32)  # source: by hand, up to four gateway chips
-_WANTED = 8  # markers that are approached; source: by hand, bounds the time of the search
+INTERVALS_S = tuple(float(f"{v:.2g}") for v in np.geomspace(0.1, 20.0, 16))  # [s] ratio of 1.42
+POWERS_DBM = (20.0, 17.0, 14.0, 11.0, 8.0)  # [dBm] halves of the SX1276's maximum
+MORE_CHANNELS = (2, 4, 8, 16, 32)  # up to four gateway chips
+_WANTED = 8  # markers that are approached; bounds the time of the search
 
 
 @dataclass(frozen=True, slots=True)

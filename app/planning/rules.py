@@ -367,14 +367,14 @@ class PlanRules(_Part):
 
 
 MAX_RULES_BYTES = 200_000
-"""Longest document. [bytes] Source: chosen by hand, a hundred times the examples."""
-_MAX_DEPTH = 20  # levels of a document; source: by hand, rules have four
-_MAX_TOKENS = 10_000  # of YAML: source: by hand, 30 times the examples, half a CPU second
+"""Longest document. [bytes] A hundred times the examples."""
+_MAX_DEPTH = 20  # levels of a document; rules have four
+_MAX_TOKENS = 10_000  # of YAML: 30 times the examples, half a CPU second
 _OPENING = (BlockMappingStartToken, BlockSequenceStartToken, FlowMappingStartToken, FlowSequenceStartToken)
 _CLOSING = (BlockEndToken, FlowMappingEndToken, FlowSequenceEndToken)
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
-_LONG_LIST = 12  # names that an error lists; source: chosen by hand
-_MAX_FAULTS = 100  # that are listed; source: chosen by hand, more than a person mends at once
+_LONG_LIST = 12  # names that an error lists
+_MAX_FAULTS = 100  # that are listed; more than a person mends at once
 
 
 class _DatesAsTexts(SafeConstructor):

@@ -44,7 +44,7 @@ from app.sensors.pose_track import PoseTrack
 Floats = npt.NDArray[np.float64]
 
 PANEL_HEIGHT = 170
-_MAX_DOTS = 1500  # packets that are drawn; chosen by hand
+_MAX_DOTS = 1500  # packets that are drawn
 _NEAR_M, _FAR_M, _HIGH_DBM, _LOW_DBM = 40.0, 400.0, -100.0, -130.0  # always shown, so that pictures compare
 _PAPER_POINTS = ((50.0, -108.0), (340.0, -125.0))  # [m, dBm] CERPM paper, section 4.1
 

@@ -39,7 +39,7 @@ _FIELD, _BAR = Panel(62, 1180, 74, 246), Panel(62, 1180, 284, 422)
 _FORWARD, _VERTICAL = "#8fb7b2", "#2d3e50"
 _BINS = 1100  # of the field along the drive; about one a pixel
 _SLOW_S = 1.0  # what changes more slowly than this is background
-_MAX_NOISE = 400  # crosses that are drawn; chosen by hand
+_MAX_NOISE = 400  # crosses that are drawn
 _BESIDE_CM = 25.0  # shown beyond the ends of the bar
 _COLOURS = {Polarity.N: RED, Polarity.S: BLUE}
 

@@ -40,9 +40,9 @@ Floats = npt.NDArray[np.float64]
 
 _WIDTH, _HEIGHT = 1200, 760
 _MAP, _SIGMA = Panel(62, 1180, 44, 540), Panel(62, 1180, 590, 720)
-_ELLIPSES = 40  # that are drawn along a track; source: by hand
-_MAX_MARKERS = 2000  # that are drawn; source: by hand
-_ELLIPSE_PX = 14.0  # [px] largest half axis of an ellipse of an ordinary stretch; source: by hand
+_ELLIPSES = 40  # that are drawn along a track
+_MAX_MARKERS = 2000  # that are drawn
+_ELLIPSE_PX = 14.0  # [px] largest half axis of an ellipse of an ordinary stretch
 
 
 def plot_track(track: Track, name: str) -> str:
@@ -248,7 +248,7 @@ def _curves(
 
 
 MAX_ARROWS = 1000
-"""Of more residuals the longest are drawn. Chosen by hand."""
+"""Of more residuals the longest are drawn."""
 _SIDE_PX, _MARGIN_PX, _HEAD_PX, _FOOT_PX = 860.0, 46.0, 64.0, 64.0
 _MIN_PX = 180.0  # [px] shortest side of the map
 _ARROW_PX = 46.0

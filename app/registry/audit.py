@@ -332,7 +332,7 @@ def list_entries(
 # differs. Only narrow columns are sorted: a sort of whole versions takes longer than all hashes.
 
 
-_PAGE = 5_000  # rows of a walk in memory at the same time; source: by hand, a few megabytes
+_PAGE = 5_000  # rows of a walk in memory at the same time; a few megabytes
 _NO_VERSIONS = hashlib.sha256().hexdigest()
 
 

@@ -123,10 +123,9 @@ def _is_one_value(values: Sequence[object]) -> bool:
 
 
 LARGE = 50_000
-"""Number of rows from which on indexes are built afterwards, if the table does not hold more rows than are loaded.
-Chosen by hand."""
-_CACHE_KIB = 32 * 1024  # [KiB] SQLite's page cache during a large load; chosen by hand
-_ROWS_PER_STATEMENT = 500  # chosen by hand
+"""Number of rows from which on indexes are built afterwards, if the table does not hold more rows than are loaded."""
+_CACHE_KIB = 32 * 1024  # [KiB] SQLite's page cache during a large load
+_ROWS_PER_STATEMENT = 500
 _MAX_VALUES = 30_000
 """SQLite accepts 32 766 values in a statement (https://www.sqlite.org/limits.html, SQLITE_MAX_VARIABLE_NUMBER)."""
 _RTREE_TRIGGER = "markers_rtree_insert"

@@ -331,8 +331,8 @@ def replace_result(connection: sa.Connection, job_id: str, result: Mapping[str, 
 
 
 LEASE = timedelta(seconds=15)
-"""How long a job stays with a process that does not renew its lease. Source: by hand; a process renews three times as
-often (`app.services.jobs`), and a job of a killed one is to run again within a minute."""
+"""How long a job stays with a process that does not renew its lease. A process renews three times as often
+(`app.services.jobs`), and a job of a killed one is to run again within a minute."""
 _ONE_AT_A_TIME = 0x5741594D41524C  # "WAYMARL": another lock than that of writers in engines.py
 
 

@@ -324,7 +324,7 @@ def _line_of_run(run: list[Any]) -> Line:
 
 _PAINTED = (_C.family == "magnet", _C.scheme == "line-tag", _C.status != "retired")
 _MAGNET_LINES = 100
-"""Number of lines whose magnets are read in one query. Chosen by hand."""
+"""Number of lines whose magnets are read in one query."""
 
 
 class MagnetLines:

@@ -61,12 +61,12 @@ AT_ONCE = 30
 _FIRST_M = 250.0
 _FAR_M = 5_000.0
 _WORLD_M = 20_038_000.0  # [m] a little more than half a meridian or equator: no two positions are farther apart
-_WIDE_DEG2 = 2_500.0  # [deg^2] for larger boxes reading all rows is faster than the index; chosen by hand
+_WIDE_DEG2 = 2_500.0  # [deg^2] for larger boxes reading all rows is faster than the index
 _FEW = 2_000
 _MANY = 4_000
 _ALL = 2**31 - 1
 _SHRINKS = 0.9
-"""Share of its radius to which a circle has to shrink; else all in it are read. Source: by hand."""
+"""Share of its radius to which a circle has to shrink; else all in it are read."""
 _CHUNK = 500
 _C = markers.c
 _PLACES = (_C.row, _C.lon_deg, _C.lat_deg)

@@ -65,7 +65,7 @@ planned_markers = sa.Table(
     sqlite_autoincrement=True,
 )
 
-_PAGE = 200  # lanes that are read at a time; source: chosen by hand
+_PAGE = 200  # lanes that are read at a time
 _P = planned_markers.c
 
 

@@ -37,7 +37,7 @@ from app.registry.marker_rows import markers
 _CELL = np.dtype([("id", ">i8"), ("box", ">f4", (4,))])
 _HEADER = np.dtype([("depth", ">u2"), ("cells", ">u2")])
 _ROOT = 1
-_PART = 20_000  # rows read or written at a time; chosen by hand
+_PART = 20_000  # rows read or written at a time
 
 Ids = npt.NDArray[np.int64]
 Boxes = npt.NDArray[np.float32]

@@ -263,7 +263,7 @@ GROUPED_ZOOM = 11
 MAX_SINGLE = 2_000
 """Features from which on a tile has groups: a browser draws as many at once without delay."""
 _OUTERMOST_DEG = 85.05112  # just inside the tiles of a zoom level
-_CELLS = 32  # across a tile; by hand: 16 px of a map that shows tiles 512 px wide
+_CELLS = 32  # across a tile: 16 px of a map that shows tiles 512 px wide
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,23 +29,23 @@ from app.geodesy.frames import ecef_from_wgs84
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
-MAX_VERTICES = 100_000  # source: by hand, bounds the memory of an axis
-MAX_EDGE_M = 20_000.0  # [m] source: by hand; longer edges are swapped or missing vertices
-MAX_LENGTH_M = 5_000_000.0  # [m] source: by hand, bounds the memory of an axis
-MAX_PARTS = 2_000  # source: by hand, bounds the time to make an axis to half a second
-MAX_OFFSET_M = 10_000.0  # [m] source: by hand, bounds the time of a search
-MAX_FEET = 20  # of a place; source: by hand, bounds an answer; roads that cross themselves have two
-MAX_PAIRS = 10_000_000  # of places and pieces of an axis in one search; source: by hand, bounds its time to 3 s
+MAX_VERTICES = 100_000  # bounds the memory of an axis
+MAX_EDGE_M = 20_000.0  # [m] longer edges are swapped or missing vertices
+MAX_LENGTH_M = 5_000_000.0  # [m] bounds the memory of an axis
+MAX_PARTS = 2_000  # bounds the time to make an axis to half a second
+MAX_OFFSET_M = 10_000.0  # [m] bounds the time of a search
+MAX_FEET = 20  # of a place; bounds an answer; roads that cross themselves have two
+MAX_PAIRS = 10_000_000  # of places and pieces of an axis in one search; bounds its time to 3 s
 _GEOD = Geod(ellps="WGS84")
-_PIECE_M = 250.0  # [m] edges are cut into pieces on which a plane is accurate to 0.1 mm (`_plane`); source: by hand
+_PIECE_M = 250.0  # [m] edges are cut into pieces on which a plane is accurate to 0.1 mm (`_plane`)
 _BEND_M = 25.0  # [m] farther from a vertex, offsets are square to the edge; source: docs/roads.md
 _SAME_PLACE_M = 1e-4  # [m] shorter edges are dropped; source: a tenth of a millimetre, below every survey
 _CORNER_RAD = np.radians(90.0)  # [rad] sharper kinks are corners; source: docs/roads.md
 _ON_BISECTOR = 1e-9  # share of a piece by which two strips overlap, so that there is no gap; source: above rounding
 _SAME_FOOT_M = 1e-4  # [m] source: `_SAME_PLACE_M`
-_PAIRS = 300_000  # of places and pieces in memory at the same time; source: by hand, about 50 MB
+_PAIRS = 300_000  # of places and pieces in memory at the same time; about 50 MB
 _REFINEMENTS = 3  # of a foot on a geodesic; source: to the nanometre (`_exact`)
-_MAX_DETOUR = 1.01  # of a strip's foot against the nearest place on the axis; source: by hand, no measurement kept
+_MAX_DETOUR = 1.01  # of a strip's foot against the nearest place on the axis
 
 
 @dataclass(frozen=True, slots=True)

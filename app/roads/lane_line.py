@@ -17,10 +17,9 @@ from app.geodesy import check_lon_lat, enu_from_wgs84, lon_lat_from_enu
 
 FloatArray = npt.NDArray[np.float64]
 MAX_LENGTH_M = 20_000.0
-"""Longest line. [m] Source: chosen by hand; in a longer one the plane frame turns bearings by more than a magnet's
-tolerance."""
-_MAX_POINTS = 100_000  # of a line; source: by hand, bounds the time
-_SAME_PLACE_M = 1e-4  # [m] points nearer than this are one; source: by hand, the step of a tag's lengths
+"""Longest line. [m] In a longer one the plane frame turns bearings by more than a magnet's tolerance."""
+_MAX_POINTS = 100_000  # of a line; bounds the time
+_SAME_PLACE_M = 1e-4  # [m] points nearer than this are one; the step of a tag's lengths
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +122,7 @@ def bearing_deg(direction: FloatArray) -> float:
 MAX_EDGE_M = 500.0
 """Longest edge of a line after `cut_edges`. [m] Source: a geodesic of this length is within 5 mm times the tangent of
 the latitude of the straight line in longitude and latitude, by its sagitta."""
-_MAX_MITRE_RAD = np.radians(170.0)  # [rad] of turn at a vertex; source: chosen by hand, a mitre of 11 offsets
+_MAX_MITRE_RAD = np.radians(170.0)  # [rad] of turn at a vertex; a mitre of 11 offsets
 _GEOD = Geod(ellps="WGS84")
 
 
@@ -188,8 +187,8 @@ def parallel_line(points_deg: FloatArray, offset_m: float) -> FloatArray:
 # Within a section, between jumps and ends of parts, measures are unique.
 
 
-MAX_PLACES = 20  # of a measure; source: by hand, bounds an answer; measures of a road occur twice
-SCALES = (0.5, 2.0)  # lowest and highest metres of measure to a metre of road; source: by hand
+MAX_PLACES = 20  # of a measure; bounds an answer; measures of a road occur twice
+SCALES = (0.5, 2.0)  # lowest and highest metres of measure to a metre of road
 _SAME_M = 1e-6  # [m] source: a micrometre, above rounding
 _ON_END_M = 1e-6  # [m] source: `_SAME_M`
 _MIN_APART_M = 1e-3  # [m] between calibration points; source: a millimetre, below every survey

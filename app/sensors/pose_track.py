@@ -14,11 +14,11 @@ from app.markers.cerpm import LaneSide, SpeedLimit
 
 Floats = npt.NDArray[np.float64]
 
-MIN_STEP_M = 5.0  # [m] shorter steps are the receiver's noise; source: by hand, docs/fleet.md
-MAX_STEP_M = 50.0  # [m] of inaccurate receivers; source: by hand
-STEP_SIGMAS = 8.0  # accuracies in a step that counts as driven; source: by hand, two positions at 5.7 sigma
-DEFAULT_STEP_M = 10.0  # [m] without a reported accuracy; source: by hand, 8 x 1.25 m
-MAX_SPEED_M_S = 70.0  # [m/s] a faster step is a gap in the track; source: by hand, 252 km/h
+MIN_STEP_M = 5.0  # [m] shorter steps are the receiver's noise; docs/fleet.md
+MAX_STEP_M = 50.0  # [m] of inaccurate receivers
+STEP_SIGMAS = 8.0  # accuracies in a step that counts as driven; two positions at 5.7 sigma
+DEFAULT_STEP_M = 10.0  # [m] without a reported accuracy; 8 x 1.25 m
+MAX_SPEED_M_S = 70.0  # [m/s] a faster step is a gap in the track; 252 km/h
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -186,8 +186,8 @@ def list_blobs(backup: BackupReader) -> list[str]:
 
 _TRIES = 3
 """How often a backup is begun. A plan's document is the only blob whose row lets go of it; if the daily cleaning then
-deletes it between the snapshot and the copy, the next snapshot refers to the new one. Source: by hand; cleaning runs
-once a day, so the second try succeeds."""
+deletes it between the snapshot and the copy, the next snapshot refers to the new one. Cleaning runs once a day, so the
+second try succeeds."""
 OWNERS = "owners/"
 Progress = Callable[[str, int, int], None]
 """What is being done, how much of it is done, and all of it."""

@@ -303,7 +303,7 @@ def _visible(connection: sa.Connection, caller: Caller, job_id: str) -> JobRow:
 
 
 KEPT = timedelta(days=7)
-"""How long the file of a job is kept. Source: chosen by hand; it can be made again."""
+"""How long the file of a job is kept. It can be made again."""
 FOLDER = "results"
 FILE_KINDS = (JobKind.ARTWORK, JobKind.EXPORT)
 _LOG = structlog.get_logger(__name__)

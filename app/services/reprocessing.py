@@ -321,7 +321,7 @@ def reprocessed_document(row: ReprocessedRow) -> ReprocessedDecode:
 
 
 SHARD = 100
-"""Uploads of one job. Source: chosen by hand; a job of frames takes a minute, and many workers share the work."""
+"""Uploads of one job. A job of frames takes a minute, and many workers share the work."""
 MAX_DECODES = 1_000_000
 _MAX_WAIT_S, _STEP_S = 30.0, 0.2
 """How long an upload gives way to jobs that somebody waits for, and how often it looks. [s]"""

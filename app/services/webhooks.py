@@ -127,7 +127,7 @@ def delivery_document(row: DeliveryRow) -> DeliveryDocument:
 
 
 MAX_WEBHOOKS = 20
-"""Of an agency. Source: chosen by hand."""
+"""Of an agency."""
 GIVE_UP_AFTER = timedelta(days=1)
 """How long a delivery is tried; then its webhook is disabled."""
 _KIND = re.compile(r"\*|[a-z]+(\.[a-z-]+)*(\.\*)?")

@@ -28,7 +28,7 @@ from app.lanes.control import (
 
 Floats = npt.NDArray[np.float64]
 
-STEP_S = 0.01  # [s] time step of simulation and controller; source: by hand, 100 Hz
+STEP_S = 0.01  # [s] time step of simulation and controller; 100 Hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Vehicle:
     # `max_acceleration_m_s2`, `max_braking_m_s2`, `drive_lag_s`: limits of speed control and its time constant
     max_acceleration_m_s2: float = 2.0  # [m/s2] source: assumed, comfortable driving
     max_braking_m_s2: float = 3.0  # [m/s2] source: assumed, comfortable driving
-    drive_lag_s: float = 0.3  # [s] source: assumed, no measurement kept
+    drive_lag_s: float = 0.3  # [s] assumed
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -128,12 +128,12 @@ def move_vehicle(x, y, yaw, speed, steer, wheelbase, dt):  # type: ignore[no-unt
 # === The simulated drive of `steering`, step by step: control law, actuators, vehicle.
 
 
-OFF_PATH_M = 3.0  # [m] of the front axle from its path, at which a drive ends; source: by hand, a lane's width
-_INTEGRATED_M = 0.15  # [m] only smaller errors are integrated; source: by hand, no measurement kept
-_MAX_INTEGRAL_RAD = 0.05  # [rad] of steering by the integral; source: by hand, 2.9 degrees of misalignment
-_SPEED_P, _SPEED_I, _SPEED_D = 1.5, 0.15, 0.05  # of the speed's PID; source: by hand, no measurement kept
+OFF_PATH_M = 3.0  # [m] of the front axle from its path, at which a drive ends; a lane's width
+_INTEGRATED_M = 0.15  # [m] only smaller errors are integrated
+_MAX_INTEGRAL_RAD = 0.05  # [rad] of steering by the integral; 2.9 degrees of misalignment
+_SPEED_P, _SPEED_I, _SPEED_D = 1.5, 0.15, 0.05  # of the speed's PID
 _SPEED_AHEAD_S = 0.5  # [s] the target speed is that of the path this far ahead; source: lag of engine and brakes
-_MAX_START_SINE = 0.5  # of the wheels' angle at the start; source: by hand, 30 degrees
+_MAX_START_SINE = 0.5  # of the wheels' angle at the start; 30 degrees
 ENDINGS = ("reached the end", "left the path", "took too long")
 REACHED_END, _LEFT_PATH, _TOOK_TOO_LONG = range(3)
 
@@ -336,7 +336,7 @@ def _step(state, command, target, control, car, first):  # type: ignore[no-untyp
 # === A simulated drive along a decoded path.
 
 
-_SPARE_S, _SPARE_SHARE = 30.0, 1.5  # [s, 1] time allowed beyond the planned one; source: by hand
+_SPARE_S, _SPARE_SHARE = 30.0, 1.5  # [s, 1] time allowed beyond the planned one
 
 
 @dataclass(frozen=True, slots=True, eq=False)

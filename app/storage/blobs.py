@@ -25,7 +25,7 @@ from app.formats.format import SpooledFile
 
 
 PART_BYTES = 64 * 1024**2
-"""Size of each part but the last. [byte] Chosen by hand; S3 allows 5 MiB to 5 GiB, and 10,000 parts."""
+"""Size of each part but the last. [byte] S3 allows 5 MiB to 5 GiB, and 10,000 parts."""
 
 
 class S3Parts:

@@ -9,8 +9,8 @@ import httpx
 from app.errors import Unavailable
 
 MAX_BYTES = 256 * 1024
-"""Largest key set. [byte] Chosen by hand."""
-_TIMEOUT_S = 5.0  # [s] chosen by hand
+"""Largest key set. [byte]"""
+_TIMEOUT_S = 5.0  # [s]
 
 
 def read_jwks(source: str) -> bytes:

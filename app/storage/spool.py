@@ -24,7 +24,7 @@ from app.formats.format import SpooledFile
 
 
 MIN_FREE_BYTES = 1024**2
-"""Room below which a folder counts as full. [byte] Chosen by hand: more than most requests store."""
+"""Room below which a folder counts as full. [byte] More than most requests store."""
 _FILE = ".probe"
 
 
@@ -49,16 +49,16 @@ def find_folder_fault(folder: Path) -> str | None:
 
 
 IN_MEMORY_BYTES = 1 << 20
-"""Largest body that is held in memory. [byte] Source: chosen by hand; a JPEG of 1080p has 0.2 to 0.8 MB."""
+"""Largest body that is held in memory. [byte] A JPEG of 1080p has 0.2 to 0.8 MB."""
 ALL_IN_MEMORY_BYTES = 64 << 20
-"""Most that all bodies in memory take together. [byte] Source: chosen by hand, a fifth of the limit of 300 MB that
-docs/uploads.md states for the server process."""
+"""Most that all bodies in memory take together. [byte] A fifth of the limit of 300 MB that docs/uploads.md states for
+the server process."""
 BLOCK_BYTES = 1 << 18
-"""Bytes that are collected before they are written. [byte] Source: chosen by hand; 64 clients hold 16 MiB."""
+"""Bytes that are collected before they are written. [byte] 64 clients hold 16 MiB."""
 MIN_AGE_S = 6 * 3600.0
 """Age from which a file that nobody writes belongs to a server that was killed. [s] Source: `blobs.MIN_AGE`."""
 KEPT_FREE_BYTES = 64 << 20
-"""Room that uploads leave on the disk, for the database. [byte] Source: chosen by hand."""
+"""Room that uploads leave on the disk, for the database. [byte]"""
 
 
 class Spool:

@@ -55,7 +55,7 @@ _LABEL = re.compile(r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9])?", re.IGNORECASE)
 _NUMBER = re.compile(r"[0-9]+|0[xX][0-9a-fA-F]*")  # as a last label: an IPv4 address in the WHATWG's URLs
 _MAX_NAME = 253
 _REGISTRATION_S = 3.0
-"""How long a registration waits for the addresses of a name. [s] Chosen by hand; a delivery checks them in any case."""
+"""How long a registration waits for the addresses of a name. [s] A delivery checks them in any case."""
 _RESOLVER = ThreadPoolExecutor(64, "resolver")
 """Threads for lookups, which cannot be stopped. Twice as many as deliveries at once, because slow names occupy them."""
 Resolve = Callable[[str, int], list[str]]

@@ -20,8 +20,8 @@ from app.surveys.location_checks import measured_changes
 
 REACH_M = 30.0
 """Longest residual of a row that is matched to its nearest marker; a longer one of a named marker is refused if it is
-also 20 times the usual. [m] Chosen by hand, checked by `python -m benchmarks.imports`."""
-_SHIFT_ROWS = 4  # rows from which on a common shift is reported; chosen by hand
+also 20 times the usual. [m] Checked by `python -m benchmarks.imports`."""
+_SHIFT_ROWS = 4  # rows from which on a common shift is reported
 
 
 class ComparisonFigures(TypedDict):

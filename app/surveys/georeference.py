@@ -27,7 +27,7 @@ Complex = npt.NDArray[np.complex128]
 _FIELD = "local_grid.control_points"
 _MAX_SCALE_PPM = 1000.0
 """Scale of a local grid beyond which a warning is given. [1e-6] UTM has up to 400 ppm, a height of 2000 m 314 ppm."""
-_REACH = 3.0  # [1] times the extent of the control points beyond which errors of them dominate; chosen by hand
+_REACH = 3.0  # [1] times the extent of the control points beyond which errors of them dominate
 
 
 class ControlResidual(TypedDict):
@@ -217,7 +217,7 @@ def _warnings(
 
 
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
-_SAMPLE = 40  # rows that other readings are tried on; chosen by hand
+_SAMPLE = 40  # rows that other readings are tried on
 _THOUSANDS = (
     (1000.0, "multiply the coordinates by 1000; in a drawing whose $INSUNITS is not their unit declare unit"),
     (0.001, "divide the coordinates by 1000: they seem to be millimetres"),

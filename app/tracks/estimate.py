@@ -47,21 +47,21 @@ from app.tracks.types import (
 
 MAX_ROUNDS = 40
 """Rounds of smoothing and gating at most. Source: `python -m benchmarks.track`: 4 to 8 are needed, rarely 30."""
-_MOVED_M, _MOVED_S = 0.01, 1e-3  # [m, s] changes that end the rounds; source: by hand, below all noise
-_READMIT = 0.8  # of the gate: no fix goes in and out in turn; source: by hand
-_NEIGHBOURS_S = 20.0  # [s] one outlier at a time is left out of this; source: by hand, it spoils what is near
+_MOVED_M, _MOVED_S = 0.01, 1e-3  # [m, s] changes that end the rounds; below all noise
+_READMIT = 0.8  # of the gate: no fix goes in and out in turn
+_NEIGHBOURS_S = 20.0  # [s] one outlier at a time is left out of this; it spoils what is near
 MAX_JUMPS = 4
-"""Steps of clocks at most. Source: by hand."""
+"""Steps of clocks at most."""
 _MIN_LEFT_OUT = 3  # fixes, from which on a step of a clock may be the cause; source: app/tracks/time_base.py
-_EXPLORED_S = 0.02  # [s2/s] by which offsets may change while steps are looked for; source: by hand, 0.5 s in 12 s
+_EXPLORED_S = 0.02  # [s2/s] by which offsets may change while steps are looked for; 0.5 s in 12 s
 _EXPLORING_ROUNDS = 3
 _MOTION = Motion(
-    position_m2_s=2e-5,  # [m2/s] source: by hand, slip of a car in bends, 5 mm in a second
-    speed_m2_s3=1.0,  # [m2/s3] source: by hand, a change of 1 m/s within a second
+    position_m2_s=2e-5,  # [m2/s] slip of a car in bends, 5 mm in a second
+    speed_m2_s3=1.0,  # [m2/s3] a change of 1 m/s within a second
     heading_rad2_s=1e-8,
-    turning_m_s2=0.7,  # [m/s2] standard deviation of the lateral acceleration; source: by hand, comfortable bends
-    scale_1_s=3e-7,  # [1/s] source: by hand, 0.4 % in a minute: slip, grades, tyres
-    bias_rad2_s=2.5e-6,  # [rad2/s] source: by hand, 0.7 deg in a minute: a compass beside steel, the drift of a gyro
+    turning_m_s2=0.7,  # [m/s2] standard deviation of the lateral acceleration; comfortable bends
+    scale_1_s=3e-7,  # [1/s] 0.4 % in a minute: slip, grades, tyres
+    bias_rad2_s=2.5e-6,  # [rad2/s] 0.7 deg in a minute: a compass beside steel, the drift of a gyro
     clock_s=0.0,
     wander_m=0.4,
     wander_length_m=100.0,

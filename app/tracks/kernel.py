@@ -31,9 +31,9 @@ from app.tracks.types import BIAS, CLOCKS, EAST, HEADING, NORTH, SCALE, SPEED, W
 # heading as the only angle.
 
 
-_TURN_S = 3.0  # [s] in which a yaw rate fades; source: by hand, half a bend
-_SLOW_M_S = 3.0  # [m/s] below, the steering limits the yaw rate and not the comfort; source: by hand, a radius of 6 m
-_LEAST_RAD_S = 0.005  # [rad/s] source: by hand, lane keeping
+_TURN_S = 3.0  # [s] in which a yaw rate fades; half a bend
+_SLOW_M_S = 3.0  # [m/s] below, the steering limits the yaw rate and not the comfort; a radius of 6 m
+_LEAST_RAD_S = 0.005  # [rad/s] lane keeping
 _A, _E2 = 6378137.0, 0.0066943799901413165  # WGS 84; source: app/geodesy/frames.py
 
 
@@ -184,7 +184,7 @@ Ints = npt.NDArray[np.int64]
 
 FIX, SPEED_SAMPLE, HEADING_SAMPLE, PATH = range(4)
 """Kinds of measurements."""
-_HUBER = 4.0  # sigmas from which a sample of speed or heading counts less; source: by hand, wheel slip, steel bridges
+_HUBER = 4.0  # sigmas from which a sample of speed or heading counts less; wheel slip, steel bridges
 
 
 class Measurements(NamedTuple):

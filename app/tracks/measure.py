@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 MIN_PASSAGES = 3
-"""Markers in a row. Source: by hand; where one in ten is wrong, three in a row are so once in 1000."""
+"""Markers in a row. Where one in ten is wrong, three in a row are so once in 1000."""
 
 
 def stretches_left_out(used: Bools, markers: Bools, passage: Ints) -> list[Ints]:
@@ -74,18 +74,17 @@ def times_lost(time_s: Floats, used: Bools, markers: Bools, passage: Ints) -> li
 
 
 COMMON_POSE_SHARE = 0.1
-"""Part of the variance of a pose that all frames past one marker share: calibration and mount of the camera. Source:
-by hand, no measurement kept."""
-_PASS_S = 30.0  # [s] fixes by a marker within this are one pass; source: by hand
-_RECEIVER_S = 60.0  # [s] in which the error of a receiver stays; source: by hand, reflections beside one street
-_RATE_OVER_S = 3.0  # [s] source: by hand, braking takes longer
+"""Part of the variance of a pose that all frames past one marker share: calibration and mount of the camera."""
+_PASS_S = 30.0  # [s] fixes by a marker within this are one pass
+_RECEIVER_S = 60.0  # [s] in which the error of a receiver stays; reflections beside one street
+_RATE_OVER_S = 3.0  # [s] braking takes longer
 _NO_HEADING = 1e6  # [rad2] variance of a heading that is not known
-_MIN_SIGMA_M = 1e-3  # [m] no fix is better; source: by hand, a tenth of the best survey
-_PATH_STEP_M = 10.0  # [m] between places where the lane's path counts; source: by hand, a tenth of the wander's length
-_PATH_NEAR_M = 8.0  # [m] further from the path it is not driven; source: by hand, two lanes
-_PATH_SPACING_M = 1.0  # [m] between points of a path that is searched; source: by hand
-_PATH_SIGMAS = 3.0  # source: by hand, beyond it the vehicle has left the lane
-_SAME_WAY = 0.87  # cosine of the angle between vehicle and lane; source: by hand, 30 deg
+_MIN_SIGMA_M = 1e-3  # [m] no fix is better; a tenth of the best survey
+_PATH_STEP_M = 10.0  # [m] between places where the lane's path counts; a tenth of the wander's length
+_PATH_NEAR_M = 8.0  # [m] further from the path it is not driven; two lanes
+_PATH_SPACING_M = 1.0  # [m] between points of a path that is searched
+_PATH_SIGMAS = 3.0  # beyond it the vehicle has left the lane
+_SAME_WAY = 0.87  # cosine of the angle between vehicle and lane; 30 deg
 _MIN_PATH_SIGMA_M = 0.02  # [m] source: app/lanes/initial_line.py
 
 
@@ -331,7 +330,7 @@ def passage_distances(
 
 
 _MAX_DOUBLINGS = 60  # of the variance; any position on earth fits then
-_NEAREST_SHARE = 0.5  # of the positions, where the track by markers is best, show how good they are; source: by hand
+_NEAREST_SHARE = 0.5  # of the positions, where the track by markers is best, show how good they are
 
 
 def is_receiver(fixes: tuple[PositionFix, ...]) -> Bools:

@@ -31,8 +31,8 @@ from app.tracks.types import (
 if TYPE_CHECKING:
     from app.tracks.estimate import Segment, Smoothed
 
-_OBSERVED = 0.5  # of the declared error of a clock: an offset with a larger one is not observable; source: by hand
-_PAUSE_S = 10.0  # [s] longer pauses without any data are gaps, whatever the filter makes of them; source: by hand
+_OBSERVED = 0.5  # of the declared error of a clock: an offset with a larger one is not observable
+_PAUSE_S = 10.0  # [s] longer pauses without any data are gaps, whatever the filter makes of them
 
 
 def collect_track(

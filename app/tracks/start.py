@@ -87,11 +87,11 @@ def local_m(fixes: tuple[PositionFix, ...]) -> Floats:
 # the smoothed track.
 
 
-_WINDOW = 40  # fixes before that a fix is compared with; source: by hand, more than one pass of frames by a plate
-_SIGMAS = 4.0  # within which two fixes agree; source: by hand, the smoother tests more closely
-_DRIFT = 0.02  # [1] error of the driven distance that is left when scale and bias are out; source: by hand
+_WINDOW = 40  # fixes before that a fix is compared with; more than one pass of frames by a plate
+_SIGMAS = 4.0  # within which two fixes agree; the smoother tests more closely
+_DRIFT = 0.02  # [1] error of the driven distance that is left when scale and bias are out
 _MAX_SPEED_M_S = 70.0  # [m/s] without a speed; source: app/sensors/pose_track.py
-_SLACK_M = 1.0  # [m] source: by hand, errors of poses beyond their covariance
+_SLACK_M = 1.0  # [m] errors of poses beyond their covariance
 
 
 def consistent_chain(
@@ -177,7 +177,7 @@ def _turn_and_scale(place_m: Floats, sigma_m: Floats, node: Ints, driven: DeadRe
 # === Where a drive starts, by a chain of fixes that agree with each other.
 
 
-_START_SIGMA_M = 2000.0  # [m] source: by hand, dead reckoning of ten minutes back to the start
+_START_SIGMA_M = 2000.0  # [m] dead reckoning of ten minutes back to the start
 
 
 def start_set(drive: DriveData) -> tuple[Bools, float, float]:

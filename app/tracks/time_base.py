@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 # === Clocks that were set while a sensor recorded.
 
 
-_MIN_STEP_S = 0.1  # [s] smaller steps are the drift of a clock; source: by hand
-_MIN_FIXES = 3  # on both sides; source: by hand, two could be outliers
-_SIGMAS = 5.0  # of a step over its standard error; source: by hand
-_BACK_S = 0.5  # [s] a step back in the order of the frames that is no late frame; source: by hand
-_MAX_BACK = 3  # steps back of a clock; more of them are no steps of a clock; source: by hand
-_BACK_SIGMA_S = 5.0  # [s] error of a clock after a step back, at least; source: by hand
+_MIN_STEP_S = 0.1  # [s] smaller steps are the drift of a clock
+_MIN_FIXES = 3  # on both sides; two could be outliers
+_SIGMAS = 5.0  # of a step over its standard error
+_BACK_S = 0.5  # [s] a step back in the order of the frames that is no late frame
+_MAX_BACK = 3  # steps back of a clock; more of them are no steps of a clock
+_BACK_SIGMA_S = 5.0  # [s] error of a clock after a step back, at least
 _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
 
 
@@ -104,14 +104,14 @@ def _spread(values: Floats) -> float:
 # === Clocks of sensors that both know the speed: the offset at which their speeds agree.
 
 
-_STEP_S = 0.1  # [s] source: by hand, the smoother finds the rest
-_MIN_OVERLAP_S = 20.0  # [s] source: by hand, one junction
-_MIN_CHANGE_M_S = 0.5  # [m/s] standard deviation of a speed that has a shape; source: by hand
-_MIN_CORRELATION = 0.9  # source: by hand, the same car
-_MIN_LEAD = 0.02  # over offsets that are more than `_APART_S` away; source: by hand
+_STEP_S = 0.1  # [s] the smoother finds the rest
+_MIN_OVERLAP_S = 20.0  # [s] one junction
+_MIN_CHANGE_M_S = 0.5  # [m/s] standard deviation of a speed that has a shape
+_MIN_CORRELATION = 0.9  # the same car
+_MIN_LEAD = 0.02  # over offsets that are more than `_APART_S` away
 _APART_S = 2.0  # [s]
-_SEARCH_SIGMAS, _MIN_SEARCH_S = 4.0, 2.0  # source: by hand
-_FOUND_SIGMA_S = 0.3  # [s] of an offset that was found so; source: by hand, three steps
+_SEARCH_SIGMAS, _MIN_SEARCH_S = 4.0, 2.0
+_FOUND_SIGMA_S = 0.3  # [s] of an offset that was found so; three steps
 
 
 def align_clocks(given: TrackInput, clocks: dict[str, Clock]) -> TrackInput:
@@ -164,13 +164,13 @@ def _correlation(a: Floats, b: Floats) -> float:
 
 
 STEP_S = 0.1
-"""Time between nodes. [s] Source: by hand; a car turns by less than 3 deg and brakes by less than 1 m/s in it."""
+"""Time between nodes. [s] A car turns by less than 3 deg and brakes by less than 1 m/s in it."""
 MAX_NUMBERS = 36_500_000
 """Numbers in the covariances of all nodes at most, 0.3 GB. Source: `python -m benchmarks.track --hours 10`, which stays
 below the memory and the time of a decoder process: 89 s and 1.2 GB, the simulation with it, for 34,500,000."""
 MAX_PAUSE_S = 600.0
-"""Longest time without any data that a track leads across. [s] Source: by hand; a constant speed is no forecast for
-ten minutes, but a wait at a ferry is one drive."""
+"""Longest time without any data that a track leads across. [s] A constant speed is no forecast for ten minutes, but a
+wait at a ferry is one drive."""
 _NEAR_S = 1.0  # [s] a node has a speed or a heading if a sample is so near; source: app/formats/traces/parts.py
 
 

@@ -162,10 +162,10 @@ class TrackRules:
 
 
 MAX_CLOCK_SIGMA_S = 10.0
-"""Largest error of a clock that an offset is estimated for. [s] Source: by hand; the filter is linear in the offset,
-and 10 s are 140 m at 50 km/h, about the distance between two markers."""
+"""Largest error of a clock that an offset is estimated for. [s] The filter is linear in the offset, and 10 s are 140 m
+at 50 km/h, about the distance between two markers."""
 MAX_LAT_DEG = 89.9
-"""Northernmost latitude. [deg] Source: by hand; 11 km from the pole a heading changes by 0.1 deg in 20 m."""
+"""Northernmost latitude. [deg] 11 km from the pole a heading changes by 0.1 deg in 20 m."""
 _LIMITS = {
     "rate_hz": (0.1, 10.0),
     "max_sigma_m": (0.05, 100.0),

@@ -17,7 +17,7 @@ from app.simulation.plate_face import Colour, Face, FloatArray, PlateLook
 from app.simulation.plate_scene import PlacedFace, PlateScene, Sensor, Shadow
 
 MARGIN = 0.08
-"""[plate sides] of the sheet around the plate. Source: chosen by hand."""
+"""[plate sides] of the sheet around the plate."""
 _FLOOR_REFLECTANCE = 0.28
 _FINE = 4  # samples a texel and side, by which edges are mixed
 

@@ -77,7 +77,7 @@ class Turns:
 
 
 _THREADS = anyio.CapacityLimiter(8)
-"""Threads that write bodies: a slow disk must not take the threads of other requests. Source: chosen by hand."""
+"""Threads that write bodies: a slow disk must not take the threads of other requests."""
 _TURNS = Turns()
 
 

@@ -51,7 +51,7 @@ client that reads nothing, with a small window, then costs 1 MB of the kernel's 
 (`python -m benchmarks.abuse --only "unread answers"`). Linux doubles it: 5 MB/s at a round trip of 100 ms."""
 _CHECK_S = 1.0
 _LINGER_S = 2.0
-"""How long a client may still send after its response. [s] Source: by hand; nginx waits 5 s (lingering_timeout)."""
+"""How long a client may still send after its response. [s] Nginx waits 5 s (lingering_timeout)."""
 _DROP_UNSENT = struct.pack("ii", 1, 0)
 """Value of SO_LINGER: on, 0 s. Source: man 7 socket."""
 _LOG = structlog.get_logger(__name__)

@@ -24,7 +24,7 @@ MEDIA_TYPE = "text/event-stream"
 HEARTBEAT_S = 15.0
 """Longest silence of a stream. [s] Source: the standard's advice for proxies that cut quiet connections."""
 MAX_STREAM_S = 900.0
-"""Longest stream; the key of a client that connects again is checked again. [s] Source: chosen by hand."""
+"""Longest stream; the key of a client that connects again is checked again. [s]"""
 RETRY_MS = 2000
 """When a client whose stream was cut connects again. [ms]"""
 MAX_STREAMS_PER_KEY = 20

@@ -159,7 +159,7 @@ SLOT_WAIT_S = 20.0
 """Longest wait for a slot. [s]"""
 _MINUTES_AT_ONCE = 10
 _WATCHED_AFTER_S = 0.1
-"""Requests that take longer are watched for the end of their connection. [s] Source: by hand; few take as long."""
+"""Requests that take longer are watched for the end of their connection. [s] Few take as long."""
 _LOOK_EVERY_S = 0.25
 _CLOSED = getattr(select, "POLLRDHUP", 0)
 """The client has closed its side, even where it sent more that nobody has read. Source: man 2 poll; Linux only, others

@@ -32,8 +32,8 @@ _OPEN = ("/v1/page-settings",)
 _METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 _AUTH_THREADS = 4
 _UNKNOWN_PER_S = 20.0
-"""Unknown keys from an address that sent too many wrong ones that are checked per second. Source: chosen by hand; a key
-that an operator chose has 24 characters or more, and 20/s are 600 million guesses a year."""
+"""Unknown keys from an address that sent too many wrong ones that are checked per second. A key that an operator chose
+has 24 characters or more, and 20/s are 600 million guesses a year."""
 _ID = re.compile(r"[0-9a-f]{8}(-?[0-9a-f]{4}){3}-?[0-9a-f]{12}")
 _RECORD = re.compile(r"/v1/markers/([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})")
 _UNLOGGED = ("/healthz", "/readyz")

@@ -174,8 +174,8 @@ def _no_cursor() -> InvalidParameter:
 
 
 MIN_YEAR, MAX_YEAR = 1900, 2200
-"""Years of times in requests. Source: by hand, so that no offset and no length of a recording leads out of the calendar
-of Python and PostgreSQL."""
+"""Years of times in requests, so that no offset and no length of a recording leads out of the calendar of Python and
+PostgreSQL."""
 
 _RFC3339 = re.compile(
     r"[0-9]{4}-[0-9]{2}-[0-9]{2}[Tt ][0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,6})?([Zz]|[+-][0-9]{2}:[0-9]{2})"

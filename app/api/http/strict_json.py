@@ -21,7 +21,7 @@ from app.services.request_work import counted
 T = TypeVar("T")
 _UNKNOWN = "extra_forbidden"
 _NEAR = 0.75
-"""How similar a name is that is proposed for an unknown one (`difflib`). Source: chosen by hand, on single slips."""
+"""How similar a name is that is proposed for an unknown one (`difflib`): single slips of the keyboard."""
 _LARGE_BYTES = 16 * 1024
 """Larger documents are read in a thread. Source: by measurement, a smaller one takes 20 ms at most."""
 _READER = ThreadPoolExecutor(1, "json")

@@ -27,7 +27,7 @@ _LOG = structlog.get_logger("waymark")
 _VALID_S = 2.0
 """How long a result of the checks is valid: clients without a key may ask as often as they like. [s]"""
 _WITHIN_S = 5.0
-"""When a check that does not end counts as failed. [s] Source: chosen by hand."""
+"""When a check that does not end counts as failed. [s]"""
 
 
 class ProcessHealth(TypedDict):

@@ -55,7 +55,7 @@ _LOOKS = {
     MAINTENANCE_ITEMS.id: {"open": "suspect", "approved": "approved", "dismissed": "dismissed"},
 }  # fmt: skip
 """Looks of the statuses that the features of a collection have; of the others, those of a marker's status."""
-_SMALLEST_ZOOM, _FULL_ZOOM = 6, 13  # symbols grow between them; chosen by hand, on a map of a motorway
+_SMALLEST_ZOOM, _FULL_ZOOM = 6, 13  # symbols grow between them; on a map of a motorway
 
 
 class VectorLayer(TypedDict):

@@ -14,7 +14,7 @@ from app.planning.proof import ProofTerms
 
 Name = Annotated[Text, Field(min_length=1, max_length=80)]
 MAX_RULES_TEXT = 50_000
-"""Longest text of rules. [characters] Source: chosen by hand, 25 times the examples; as YAML it takes seconds."""
+"""Longest text of rules. [characters] 25 times the examples; as YAML it takes seconds."""
 
 
 class _Body(BaseModel):

@@ -162,7 +162,7 @@ def photo_fault(error: UnreadableUpload | InvalidParameter, photo_mb: int) -> Fa
 
 
 _MISS_COST = 5.0
-"""Pages that an address which has no page counts as. Source: chosen by hand; who follows a QR code asks for one."""
+"""Pages that an address which has no page counts as. Who follows a QR code asks for one."""
 _CURE = "wait for the time in Retry-After"
 
 

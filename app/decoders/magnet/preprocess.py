@@ -23,36 +23,35 @@ Integers = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 BLOCK_M = 0.02
-"""Samples nearer to each other than this are averaged. [m] Source: chosen by hand, less than half a bin
+"""Samples nearer to each other than this are averaged. [m] Less than half a bin
 (`app.decoders.magnet.matched_filter.BIN_M`)."""
 MIN_GAP_S = 0.1
-"""A longer interval between samples is reported as a gap. [s] Source: chosen by hand, 35 samples of METRO's 350 Hz."""
+"""A longer interval between samples is reported as a gap. [s] 35 samples of METRO's 350 Hz."""
 MAX_GAP_M = 10.0
-"""Most distance that is counted over a gap. [m] Source: chosen by hand."""
+"""Most distance that is counted over a gap. [m]"""
 MAX_INTERPOLATION_S = 1.0
-"""A speed is interpolated between values at most so far apart, else the last one is kept. [s] Source: chosen by hand,
-ten values of METRO's CAN bus (section 7.1: 10 Hz)."""
+"""A speed is interpolated between values at most so far apart, else the last one is kept. [s] Ten values of METRO's CAN
+bus (section 7.1: 10 Hz)."""
 MAX_HEADING_INTERPOLATION_S = 3.0
-"""The same for headings. [s] Source: chosen by hand, three values of a receiver at 1 Hz."""
+"""The same for headings. [s] Three values of a receiver at 1 Hz."""
 MIN_SPIKE_UT = 25.0
-"""Smallest deviation of a spike from the samples around it. [uT] Source: chosen by hand, no measurement kept."""
+"""Smallest deviation of a spike from the samples around it. [uT]"""
 SPIKE_RATIO = 4.0
-"""A spike deviates so many times as much as its neighbours on the bar. Source: chosen by hand, no measurement kept."""
+"""A spike deviates so many times as much as its neighbours on the bar."""
 MIN_NEIGHBOUR_UT = 4.0
-"""Deviation that is assumed of neighbours that deviate less. [uT] Source: chosen by hand, 2 to 3 times a chip's
-noise."""
+"""Deviation that is assumed of neighbours that deviate less. [uT] 2 to 3 times a chip's noise."""
 SPIKE_MISMATCH, SPIKE_NOISE_UT = 0.15, 3.0
 """A single outlier bends the sample before it by minus half of its own deviation. The difference may be this share, or
-this much. [1, uT] Source: the second difference; levels chosen by hand, no measurement kept."""
+this much. [1, uT] Source: the second difference."""
 SURE_SPIKE_UT, SURE_MISMATCH, SURE_NOISE_UT = 60.0, 0.05, 6.0
-"""The same for spikes that are accepted whatever their neighbours do. [uT, 1, uT] Source: chosen by hand; a magnet at
-30 m/s must remain (`tests/decoders/magnet/test_preprocess.py`)."""
+"""The same for spikes that are accepted whatever their neighbours do. [uT, 1, uT] A magnet at 30 m/s must remain
+(`tests/decoders/magnet/test_preprocess.py`)."""
 NEIGHBOUR_REACH_M = 0.25
 """Farthest neighbour on the bar. [m] Source: METRO's spacing of 16 cm (section 5.1), with room for other bars."""
 AHEAD = 2
-"""Samples that are looked at ahead: the next one may be faulty. Source: chosen by hand."""
+"""Samples that are looked at ahead: the next one may be faulty."""
 FORGET_BLOCKS = 400
-"""Blocks after which old ones are dropped. Source: chosen by hand, speed only."""
+"""Blocks after which old ones are dropped. Speed only."""
 
 
 class Blocks:
@@ -388,20 +387,20 @@ def _repair_and_average(raw: Floats, drive: Floats, repair: _Repair, block: _Ope
 Floats32 = npt.NDArray[np.float32]
 
 LAG_BINS = 8
-"""Bins on each side of the second difference (the bend) by which noise is measured: 40 cm. Source: chosen by hand,
-longer than a magnet's pulse at METRO's clearance."""
+"""Bins on each side of the second difference (the bend) by which noise is measured: 40 cm. Longer than a magnet's pulse
+at METRO's clearance."""
 NOISE_RATE = 0.01
-"""Share of a bin in the running mean squares: 5 m of road. Source: chosen by hand, no measurement kept."""
+"""Share of a bin in the running mean squares: 5 m of road."""
 CLIP_VARIANCES = 9.0
-"""Squares count up to so many variances, three standard deviations: magnets are no noise. Source: chosen by hand."""
+"""Squares count up to so many variances, three standard deviations: magnets are no noise."""
 OWN_NOISE_FACTOR = 1.5
-"""The common mode's mean square must exceed so many times what the sensors' own noise gives. Source: chosen by hand."""
+"""The common mode's mean square must exceed so many times what the sensors' own noise gives."""
 QUIET_RATIO = 0.5
-"""A channel is noisier than the others from twice the median on; less is chance, or the magnets. Source: by hand."""
+"""A channel is noisier than the others from twice the median on; less is chance, or the magnets."""
 MIN_VARIANCE = 1e-9
-"""Keeps ratios of variances finite. [uT2] Source: chosen by hand, far below a chip's noise."""
+"""Keeps ratios of variances finite. [uT2] Far below a chip's noise."""
 GROWTH_BINS, FORGET_BINS = 256, 400
-"""Bins by which the arrays grow, and after which old ones are dropped. Source: chosen by hand, speed only."""
+"""Bins by which the arrays grow, and after which old ones are dropped. Speed only."""
 
 
 class _Bins(NamedTuple):

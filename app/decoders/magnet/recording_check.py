@@ -24,9 +24,9 @@ from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 Floats = npt.NDArray[np.float64]
 
 SURE_CONFIDENCE = 0.99
-"""[probability] of a magnet that counts. Source: chosen by hand."""
+"""[probability] of a magnet that counts."""
 MIN_MAGNETS = 4
-"""[magnets] that another declaration must give. Source: by hand: a tag has three, and iron gives one now and then."""
+"""[magnets] that another declaration must give. A tag has three, and iron gives one now and then."""
 USUAL_STRENGTH = (0.65, 1.25)
 """[nominal moment] Strengths that the magnets of a recording have. Source: drives of the scene hunter (decision 0014):
 speeds that are 1.6 times too low make it 0.4 to 0.6, speeds that are 1.6 times too high 1.1 to 1.5."""
@@ -35,7 +35,7 @@ MIN_RATIO, MIN_SHARE = 4.0, 0.9
 read, and where all are too weak or too strong. Source: the same drives; the right unit explains 0.93 to 5 times as
 much as one that makes them too weak."""
 MAX_REJECTED = 0.5
-"""[1] Dipoles that are no magnets, over the sure magnets, from which on the declaration is checked. Source: by hand."""
+"""[1] Dipoles that are no magnets, over the sure magnets, from which on the declaration is checked."""
 PIECE_S = 30.0
 """[s] of the piece of a recording, where the field changes most, that is decoded again: thirteen decodes take one to
 three seconds of one core."""
@@ -60,18 +60,18 @@ EARTH_HORIZONTAL_UT = (8.0, 60.0)
 """[uT] amplitude with which the earth's horizontal field turns. Source: it is 10 to 42 uT below 65 degrees of latitude
 (World Magnetic Model); a third of margin for the iron of a vehicle."""
 MIN_TURN_DEG, RATE_HZ = 60.0, 5.0
-"""[deg, Hz] change of heading from which on the earth's field is compared, and rate at which. Source: by hand."""
+"""[deg, Hz] change of heading from which on the earth's field is compared, and rate at which."""
 MAX_RESIDUAL = 0.5
-"""[amplitude] root mean square of what the turning field leaves, above which nothing is concluded. Source: by hand."""
+"""[amplitude] root mean square of what the turning field leaves, above which nothing is concluded."""
 MAX_PHASE_DEG = 60.0
 """[deg] between the heading and the field's direction. Source: magnetic declination is below 30 degrees in inhabited
 regions (World Magnetic Model), and iron adds some."""
 MIRRORED = 2.0
-"""[1] amplitude of the field that turns the other way over that of the one that turns as it must. Source: by hand."""
+"""[1] amplitude of the field that turns the other way over that of the one that turns as it must."""
 
 
 CONTRADICTED_M = 0.06
-"""[m] between the declared clearance and that of the magnets. Source: a load lowers a car by up to 5 cm; by hand."""
+"""[m] between the declared clearance and that of the magnets. Source: a load lowers a car by up to 5 cm."""
 
 
 @dataclass(frozen=True, slots=True)

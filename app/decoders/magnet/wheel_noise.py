@@ -21,71 +21,90 @@ from app.compiled import kernel, routine
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-HARMONICS = 8
-"""Harmonics of a turn that are cancelled. Source: chosen by hand, no measurement kept."""
+# Distances over which the filter learns, in turns of some two metres, and limits of what a wheel can be like. They were
+# chosen where no measurement stands beside them. `python -m benchmarks.magnets wheel drawn` checks them: the passes of
+# METRO's section 7.2, and magnets that are found beside wheels of any strength.
+
+# Length of a turn.
 CIRCUMFERENCES_M = np.geomspace(1.6, 2.4, 64)
-"""Trial lengths of a turn. [m] Source: rolling circumferences of car tyres; steps of 0.6 %, refined by a parabola."""
-BANK_HARMONICS = 6
-"""Harmonics by which the length of a turn is found. Source: chosen by hand."""
-BANK_M = 30.0
-"""Distance over which the length of a turn is found. [m] Source: chosen by hand, some 15 turns."""
-RENEW_M = 0.1
-"""Distance after which the bank of trial lengths is renewed. [m] Source: chosen by hand for speed."""
-LEARN_M, FIRST_LEARN_M, LEARN_SLOPE = 60.0, 3.0, 0.6
-"""Distance over which harmonics are learnt: in the long run, at first, and its growth per distance. [m, m, 1] Source:
-in less, the magnets of a line that are about as far apart as a turn is long are learnt too (decision 0014)."""
-OFFSET_M, FIRST_OFFSET_M = 6.0, 0.5
-"""Distance over which a channel's offset is averaged, in the long run and at first. [m] Source: three turns."""
-STRENGTH_M = 10.0
-"""Distance over which the strengths of noise and residual are averaged. [m] Source: chosen by hand, five turns."""
+"""[m] trial lengths: rolling circumferences of car tyres; steps of 0.6 %, refined by a parabola."""
+BANK_HARMONICS = 6  # by which the length is found
+BANK_M = 30.0  # [m] over which it is found
+RENEW_M = 0.1  # [m] after which the bank of trial lengths is renewed, for speed
 MIN_PERIODIC, STILL_PERIODIC = 1.8, 1.0
 """Energy of a reference's signal that repeats with the turns, for a wheel to count as noisy and to go on doing so,
-over what white noise has on average in as many harmonics. Source: the best of 64 trial lengths has 1.7 at most in 90
-drives of 150 m of white noise."""
-START_M = 8.0
-"""Distance before a wheel can count as noisy, and for which a magnet is not looked for. [m] Source: four turns."""
-FADE_AFTER_M, FADE_M = 3.0, 8.0
-"""The noise is taken out gradually, from so far after a wheel was found noisy, over this. [m] Source: by hand."""
-CLIP, FIRST_CLIP, FIRST_CLIP_M = 3.0, 3.0, 6.0
-"""Residuals count up to so many mean deviations, and so many times that over the first metres. Source: by hand."""
+over what white noise has on average in as many harmonics. The best of 64 trial lengths has 1.7 at most in 90 drives of
+150 m of white noise."""
+START_M = 8.0  # [m] before a wheel can count as noisy, and for which a magnet is not looked for
+STEER_M, FOLLOW_M = 4.0, 12.0
+"""[m] over which the phase of a turn follows the noise at its reference, and that since the wheel was found noisy from
+which on it does. In drives with strong wheels at 40 cm as many magnets are read with 2 to 8 m."""
+MAX_STEP_M = 0.5  # [m] longest step between two blocks: longer ones are gaps
+FIRST_LENGTH_M = 2.0  # [m] of a turn, assumed at first: the range's middle
+
+# What is learnt of each channel.
+HARMONICS = 8  # of a turn that are cancelled
+OFFSET_M, FIRST_OFFSET_M = 6.0, 0.5  # [m] over which a channel's offset is averaged, in the long run and at first
+LEARN_M, FIRST_LEARN_M, LEARN_SLOPE = 60.0, 3.0, 0.6
+"""[m, m, 1] distance over which harmonics are learnt: in the long run, at first, and its growth per distance. In less,
+the magnets of a line that are about as far apart as a turn is long are learnt too (decision 0014)."""
+NEAR_M = 0.3
+"""[m] added to the distance of a sensor from a reference, which is that far from the wheel; with 0.8 m as many magnets
+are read."""
+STRENGTH_M = 10.0  # [m] over which the strengths of noise and residual are averaged
+CLIP = 3.0  # [mean deviations] up to which a residual counts
+FIRST_CLIP, FIRST_CLIP_M = 3.0, 6.0  # [1, m] factor on it over the first metres
+OUTLIER_CHANNELS = 3  # off by more than `CLIP` deviations are a magnet or iron, from which nothing is learnt
+MAGNET_RATE = 0.1  # factor on the rate at which the residual's strength follows over a magnet
 MEAN_DEVIATION = 1.25
-"""Standard deviation over mean absolute deviation of Gaussian noise. Source: normal distribution, sqrt(pi / 2)."""
+"""Standard deviation over mean absolute deviation of Gaussian noise: sqrt(pi / 2)."""
 MEDIAN_DEVIATION, MIN_ERROR_UT = 1.48, 1.0
-"""Deviation over median deviation of Gaussian noise, and the least deviation. [1, uT] Source: normal law; a chip's."""
-SMOOTH_M, MIN_STEP_M = 4.0, 0.001
-"""Length of the moving mean that is taken off first, and the least mean step. [m, m] Source: two turns; by hand."""
+"""[1, uT] deviation over median deviation of Gaussian noise, and the least deviation: a chip's."""
+FIRST_ERROR_UT = 3.0  # [uT] residual that is assumed at first: twice a chip's noise
+SMOOTH_M, MIN_STEP_M = 4.0, 0.001  # [m] of the moving mean that is taken off a beginning, and the least mean step
+
+# What is taken out.
+FADE_AFTER_M, FADE_M = 3.0, 8.0  # [m] since a wheel was found noisy, from which on and over which it grows to all
+HALF_GAIN = 0.1  # strength of the noise over the residual's variance at which half of it is taken out
 MAX_LOUDNESS, LOUDNESS_M, LOUDNESS = 4.0, 0.3, 12.0
-"""Largest strength of a wheel's noise at a sensor over that at the reference beside the wheel: at most the first, and
-the third times the sixth power of the second over the distance across the vehicle. [1, m, 1] Source: 300 wheels of 2 to
-7 random dipoles have up to 3.7 at 0 to 0.2 m, 0.82 at 0.32 m, 0.21 at 0.48 m and 0.06 at 0.64 m."""
+"""[1, m, 1] largest strength of a wheel's noise at a sensor over that at the reference beside the wheel: at most the
+first, and the third times the sixth power of the second over the distance across the vehicle. 300 wheels of 2 to 7
+random dipoles have up to 3.7 at 0 to 0.2 m, 0.82 at 0.32 m, 0.21 at 0.48 m and 0.06 at 0.64 m."""
 MAX_RISE, MAX_RISE_NEAR = 0.45, 0.9
 """Largest strength of a wheel's noise at a sensor over the sum at the two beside it, as it falls away; the same near
-the wheel. Source: 1,000 such wheels have up to 0.42 and 1.09; 99 % have up to 0.77 near the wheel."""
+the wheel. 1,000 such wheels have up to 0.42 and 1.09; 99 % have up to 0.77 near the wheel."""
 FAR_M, NEAR_WHEEL_M, APART_M = 0.25, 0.1, 0.12
-"""Distance across from a reference from which on `MAX_RISE` holds, up to which nothing is strange; least distance of
-sensors beside. [m] Source: as these, METRO's spacing of 16 cm: over less, the noise falls less."""
+"""[m] distance across from a reference from which on `MAX_RISE` holds, up to which nothing is strange; least distance
+of sensors beside: less than METRO's spacing of 16 cm."""
 MIN_STRANGE = 0.3
-"""Strength that is never strange, over the residual's variance: white noise is learnt as well. Source: with 0.1, wheels
-with 0.7 A m2 were no longer cancelled at 35 cm."""
-GATE_OPENS, GATE_M = 0.8, 2.0
-"""Share of every limit below which noise is taken out again; distance of fading. [1, m] Source: by hand."""
-HALF_GAIN = 0.1
-"""Strength of the noise over the residual's variance at which half of it is taken out. Source: chosen by hand."""
-STEER_M, FOLLOW_M = 4.0, 12.0
-"""Distance over which the phase of a turn follows the noise at its reference, and that since the wheel was found noisy
-from which on it does. [m, m] Source: drives with strong wheels at 40 cm; with 2 to 8 m as many magnets are read."""
-OUTLIER_CHANNELS = 3
-"""So many channels off by more than `CLIP` deviations are a magnet or iron, from which nothing is learnt. Source: by
-hand; what magnets lost without it was not kept (change "learn wheel noise away from magnets")."""
-MAGNET_RATE = 0.1
-"""Factor on the rate at which the residual's strength follows over a magnet. Source: chosen by hand."""
-NEAR_M = 0.3
-"""Added to the distance of a sensor from a reference, which is that far from the wheel. [m] Source: by hand; with 0.8 m
-as many magnets are read."""
-MAX_STEP_M = 0.5
-"""Longest step between two blocks: longer ones are gaps. [m] Source: chosen by hand."""
-FIRST_ERROR_UT, FIRST_LENGTH_M = 3.0, 2.0
-"""Residual and length of a turn that are assumed at first. [uT, m] Source: twice a chip's noise; the range's middle."""
+"""Strength that is never strange, over the residual's variance: white noise is learnt as well. With 0.1, wheels with
+0.7 A m2 were no longer cancelled at 35 cm."""
+GATE_OPENS, GATE_M = 0.8, 2.0  # [1, m] share of every limit below which noise is taken out again; distance of fading
+
+
+class _Progress:
+    """How far a drive has come: a record, of whose fields these are names and types."""
+
+    has_begun: bool
+    odometer_m: float  # of the newest block
+    yaw_rad: float  # of the newest block
+    driven_m: float
+    errors_known: bool  # deviations of the residuals were estimated beforehand
+    is_strange: bool  # what was learnt cannot be a wheel's
+    gate: float  # how much of the noise is taken out: it falls to 0 while that is so
+
+
+_PROGRESS = np.dtype((np.record, list(_Progress.__annotations__.items())))
+
+
+class _Trials(NamedTuple):
+    """Memory for one harmonic of a turn of each trial length, each of shape (L,)."""
+
+    cosine: Floats  # of the turn
+    sine: Floats
+    cosine_h: Floats  # of its harmonic h
+    sine_h: Floats
+    energy: Floats  # of the signal in all harmonics
 
 
 class _Turns(NamedTuple):
@@ -96,9 +115,10 @@ class _Turns(NamedTuple):
     rolled_m: Floats  # (W,) so far
     lengths_m: Floats  # (L,) trial lengths
     bank: Floats  # (W, 2, H, 3, L) running correlations with the cosine and sine of each trial length
-    work: Floats  # (5, L) cosine and sine of a turn of each trial length, of a harmonic, and energies
+    trials: _Trials
     power: Floats  # (W, 3) running signal power [uT2 m]
-    pending: Floats  # (W, 4) distance and integral of the signal since the bank was renewed
+    pending_m: Floats  # (W,) distance since the bank was renewed
+    pending_ut_m: Floats  # (W, 3) integral of the signal over it
     length_m: Floats  # (W,) of a turn
     periodic: Floats  # (W,) energy that repeats with the turns, over what white noise has in as many harmonics
     phase: Floats  # (W,) of the turn [rad]
@@ -114,10 +134,15 @@ class _Channels(NamedTuple):
     strength: Floats  # (S, 3) mean square of the noise [uT2]
     residual: Floats  # (S, 3) of the present block [uT]
     regressors: Floats  # (2 W HARMONICS,) of the present block
-    limits: Floats  # (S, 2) largest strength over the loudest reference's, and over the sum of the neighbours'
-    neighbours: Integers  # (S, 2) the sensors beside each, -1 where a wheel may be as loud
-    gate: Floats  # (2,) 1 while what was learnt is strange, and how much of the noise is taken out
     near: Floats  # (S, W) how much of its noise a sensor can have from each wheel, 1 for the nearest
+
+
+class _Limits(NamedTuple):
+    """The most noise that a wheel can have at each sensor."""
+
+    loudness: Floats  # (S,) strength over the loudest reference's
+    rise: Floats  # (S,) strength over the sum of those at the sensors beside
+    beside: Integers  # (S, 2) these sensors, -1 where a wheel may be as loud
 
 
 class WheelNoiseCanceller:
@@ -134,32 +159,33 @@ class WheelNoiseCanceller:
     def __init__(self, references: npt.NDArray[np.intp], positions_m: Floats) -> None:
         sensors = len(positions_m)
         wheels, regressors = len(references), 2 * len(references) * HARMONICS
+        lengths = CIRCUMFERENCES_M.size
         self._turns = _Turns(
-            references.astype(np.int64),
-            np.ascontiguousarray(positions_m[references, 1]),
-            np.zeros(wheels),
-            CIRCUMFERENCES_M.copy(),
-            np.zeros((wheels, 2, BANK_HARMONICS, 3, CIRCUMFERENCES_M.size)),
-            np.zeros((5, CIRCUMFERENCES_M.size)),
-            np.zeros((wheels, 3)),
-            np.zeros((wheels, 4)),
-            np.full(wheels, FIRST_LENGTH_M),
-            np.zeros(wheels),
-            np.zeros(wheels),
-            np.zeros(wheels),
+            references=references.astype(np.int64),
+            left_m=np.ascontiguousarray(positions_m[references, 1]),
+            rolled_m=np.zeros(wheels),
+            lengths_m=CIRCUMFERENCES_M.copy(),
+            bank=np.zeros((wheels, 2, BANK_HARMONICS, 3, lengths)),
+            trials=_Trials(*np.zeros((5, lengths))),
+            power=np.zeros((wheels, 3)),
+            pending_m=np.zeros(wheels),
+            pending_ut_m=np.zeros((wheels, 3)),
+            length_m=np.full(wheels, FIRST_LENGTH_M),
+            periodic=np.zeros(wheels),
+            phase=np.zeros(wheels),
+            locked_m=np.zeros(wheels),
         )
         self._channels = _Channels(
-            np.zeros((sensors, 3)),
-            np.zeros((sensors, 3, regressors)),
-            np.full((sensors, 3), FIRST_ERROR_UT),
-            np.zeros((sensors, 3)),
-            np.zeros((sensors, 3)),
-            np.zeros(regressors),
-            *_limits(positions_m, references),
-            np.zeros(2),
-            _nearness(positions_m, references),
+            offset=np.zeros((sensors, 3)),
+            weights=np.zeros((sensors, 3, regressors)),
+            error=np.full((sensors, 3), FIRST_ERROR_UT),
+            strength=np.zeros((sensors, 3)),
+            residual=np.zeros((sensors, 3)),
+            regressors=np.zeros(regressors),
+            near=_nearness(positions_m, references),
         )
-        self._drive = np.zeros(5)  # 1 once begun, s and yaw of the newest block, distance driven, 1 if errors are known
+        self._limits = _wheel_limits(positions_m, references)
+        self._progress = np.zeros(1, _PROGRESS)
 
     def cancel(self, s: Floats, yaw: Floats, x: Floats) -> None:
         """Take the noise out of blocks at odometers s and yaw (N,), anticlockwise: x (N, S, 3), in place. [m, rad, uT]
@@ -167,7 +193,7 @@ class WheelNoiseCanceller:
         In a bend, a wheel rolls less by the change of yaw times how far to the left of the middle it is.
         """
         if self._turns.references.size and s.size:
-            _cancel(s, yaw, x, self._turns, self._channels, self._drive)
+            _cancel(s, yaw, x, self._turns, self._channels, self._limits, self._progress[0])
 
     def learn_beginning(self, s: Floats, yaw: Floats, x: Floats) -> None:
         """Learn the noise of the first blocks of a recording (as for `cancel`), forwards and back; x stays as it is.
@@ -189,7 +215,7 @@ class WheelNoiseCanceller:
         blocks = math.ceil(SMOOTH_M / max(float(s[-1] - s[0]) / s.size, MIN_STEP_M))
         median = np.median(abs(x - uniform_filter1d(x, blocks, axis=0)), axis=0)
         self._channels.error[:] = np.maximum(MEDIAN_DEVIATION * median, MIN_ERROR_UT)
-        self._drive[4] = 1.0
+        self._progress["errors_known"] = True
 
     def _reverse(self) -> None:
         """Go on in the opposite direction: the phases and distances change their signs, and with them all sines."""
@@ -200,8 +226,10 @@ class WheelNoiseCanceller:
             self._channels.weights[..., 1::2],
         ):
             part *= -1.0
-        self._turns.pending[:] = 0.0
-        self._drive[1:3] *= -1.0
+        self._turns.pending_m[:] = 0.0
+        self._turns.pending_ut_m[:] = 0.0
+        self._progress["odometer_m"] *= -1.0
+        self._progress["yaw_rad"] *= -1.0
 
 
 def _nearness(positions_m: Floats, references: npt.NDArray[np.intp]) -> Floats:
@@ -217,48 +245,56 @@ def _nearness(positions_m: Floats, references: npt.NDArray[np.intp]) -> Floats:
     return np.asarray(energy / energy.max(axis=1, keepdims=True))
 
 
-def _limits(positions_m: Floats, references: npt.NDArray[np.intp]) -> tuple[Floats, Integers]:
-    """What a wheel can be like: `limits` and `neighbours` of `_Channels`."""
+def _wheel_limits(positions_m: Floats, references: npt.NDArray[np.intp]) -> _Limits:
+    """How a wheel's noise falls away from its reference across the vehicle."""
     sensors = len(positions_m)
-    limits, neighbours = np.full((sensors, 2), MAX_LOUDNESS), np.full((sensors, 2), -1, np.int64)
+    loudness, rise = np.full(sensors, MAX_LOUDNESS), np.full(sensors, MAX_LOUDNESS)
+    beside = np.full((sensors, 2), -1, np.int64)
     if not len(references):
-        return limits, neighbours
+        return _Limits(loudness, rise, beside)
     across = np.abs(positions_m[:, None, 1] - positions_m[references, 1]).min(axis=1)
-    limits[:, 0] = np.minimum(MAX_LOUDNESS, LOUDNESS * (LOUDNESS_M / np.hypot(across, LOUDNESS_M)) ** 6)
-    limits[:, 1] = np.where(across >= FAR_M, MAX_RISE, MAX_RISE_NEAR)
+    loudness = np.minimum(MAX_LOUDNESS, LOUDNESS * (LOUDNESS_M / np.hypot(across, LOUDNESS_M)) ** 6)
+    rise = np.where(across >= FAR_M, MAX_RISE, MAX_RISE_NEAR)
     y = np.where(np.isin(np.arange(sensors), references), np.nan, positions_m[:, 1])  # of array sensors
     for j in np.flatnonzero(across >= NEAR_WHEEL_M):
         low, high = np.flatnonzero(y <= y[j] - APART_M), np.flatnonzero(y >= y[j] + APART_M)
         if low.size and high.size:
-            neighbours[j] = low[np.argmax(y[low])], high[np.argmin(y[high])]
-    return limits, neighbours
+            beside[j] = low[np.argmax(y[low])], high[np.argmin(y[high])]
+    return _Limits(loudness, rise, beside)
 
 
 @kernel
-def _cancel(s: Floats, yaw: Floats, x: Floats, turns: _Turns, channels: _Channels, drive: Floats) -> None:
+def _cancel(
+    s: Floats, yaw: Floats, x: Floats, turns: _Turns, channels: _Channels, limits: _Limits, progress: _Progress
+) -> None:
     """Follow the turns, take the noise out of each block and learn from what is left."""
     for i in range(s.size):
-        if drive[0] == 0:
-            drive[0], drive[1], drive[2] = 1.0, s[i], yaw[i]
+        if not progress.has_begun:
+            progress.has_begun = True
+            progress.odometer_m = s[i]
+            progress.yaw_rad = yaw[i]
             _track_offset(x[i], 1.0, channels)
             continue
-        step = min(max(s[i] - drive[1], 0.0), MAX_STEP_M)
-        drive[1] = s[i]
-        drive[3] += step
+        step = min(max(s[i] - progress.odometer_m, 0.0), MAX_STEP_M)
+        progress.odometer_m = s[i]
+        progress.driven_m += step
         if step <= 0:
             continue
-        turned = yaw[i] - drive[2]
-        drive[2] = yaw[i]
-        _track_offset(x[i], min(step / min(OFFSET_M, FIRST_OFFSET_M + drive[3]), 1.0), channels)
+        turned = yaw[i] - progress.yaw_rad
+        progress.yaw_rad = yaw[i]
+        _track_offset(x[i], min(step / min(OFFSET_M, FIRST_OFFSET_M + progress.driven_m), 1.0), channels)
         for w in range(turns.references.size):
             rolled_m = min(max(step - turns.left_m[w] * turned, 0.0), 2 * step)
-            _follow_turn(w, rolled_m, drive[3], x[i], turns, channels)
+            _follow_turn(w, rolled_m, progress.driven_m, x[i], turns, channels)
         locked_m = turns.locked_m.max()
         if locked_m > 0:
-            outliers = _subtract_noise(x[i], step, locked_m, _loudest(turns, channels), channels)
+            loudest = _loudest(turns, channels)
+            _set_gate(step, _strangeness(loudest, channels, limits), progress)
+            fade = progress.gate * min(max((locked_m - FADE_AFTER_M) / FADE_M, 0.0), 1.0)
+            outliers = _subtract_noise(x[i], step, fade, loudest, channels)
             if locked_m > FOLLOW_M:
                 _steer(step, turns, channels)
-            known = locked_m > START_M or drive[4] > 0
+            known = locked_m > START_M or progress.errors_known
             _learn(step, locked_m, outliers >= OUTLIER_CHANNELS and known, channels)
 
 
@@ -273,14 +309,15 @@ def _track_offset(x: Floats, rate: float, channels: _Channels) -> None:
 @routine
 def _follow_turn(w: int, step: float, driven_m: float, x: Floats, turns: _Turns, channels: _Channels) -> None:
     """Advance a wheel's phase by what it rolled for a block (S, 3), and set its regressors: 0 unless it is noisy."""
-    reference, pending = turns.references[w], turns.pending[w]
+    reference = turns.references[w]
     turns.rolled_m[w] += step
-    pending[0] += step
+    turns.pending_m[w] += step
     for axis in range(3):
-        pending[1 + axis] += step * (x[reference, axis] - channels.offset[reference, axis])
-    if pending[0] > RENEW_M:
-        _renew_length(w, turns.rolled_m[w] - pending[0] / 2, turns)
-        pending[:] = 0.0
+        turns.pending_ut_m[w, axis] += step * (x[reference, axis] - channels.offset[reference, axis])
+    if turns.pending_m[w] > RENEW_M:
+        _renew_length(w, turns.rolled_m[w] - turns.pending_m[w] / 2, turns)
+        turns.pending_m[w] = 0.0
+        turns.pending_ut_m[w, :] = 0.0
     turns.phase[w] = (turns.phase[w] + 2 * math.pi * step / turns.length_m[w]) % (2 * math.pi)
     noisy = turns.periodic[w] > (STILL_PERIODIC if turns.locked_m[w] > 0 else MIN_PERIODIC) and driven_m > START_M
     turns.locked_m[w] = turns.locked_m[w] + step if noisy else 0.0
@@ -298,18 +335,19 @@ def _renew_length(w: int, s: float, turns: _Turns) -> None:
 
     The bank holds the first harmonics of a Fourier series for each trial length, forgetting over `BANK_M`.
     """
-    pending, bank, lengths = turns.pending[w], turns.bank[w], turns.lengths_m
-    keep = math.exp(-pending[0] / BANK_M)
+    pending_m, pending_ut_m = turns.pending_m[w], turns.pending_ut_m[w]
+    bank, lengths = turns.bank[w], turns.lengths_m
+    keep = math.exp(-pending_m / BANK_M)
     total = 1e-9
     for axis in range(3):
-        turns.power[w, axis] = keep * turns.power[w, axis] + pending[1 + axis] ** 2 / pending[0]
+        turns.power[w, axis] = keep * turns.power[w, axis] + pending_ut_m[axis] ** 2 / pending_m
         total += turns.power[w, axis]
     _set_turns(s, turns)
-    cosine, sine, cosine_h, sine_h, energy = turns.work
+    cosine, sine, cosine_h, sine_h, energy = turns.trials
     cosine_h[:], sine_h[:], energy[:] = cosine, sine, 0.0
     for h in range(bank.shape[1]):
         for axis in range(3):
-            piece, real, imaginary = pending[1 + axis], bank[0, h, axis], bank[1, h, axis]
+            piece, real, imaginary = pending_ut_m[axis], bank[0, h, axis], bank[1, h, axis]
             for c in range(lengths.size):
                 real[c] = keep * real[c] + piece * cosine_h[c]
                 imaginary[c] = keep * imaginary[c] + piece * sine_h[c]
@@ -321,7 +359,7 @@ def _renew_length(w: int, s: float, turns: _Turns) -> None:
             )
     at = int(np.argmax(energy))
     turns.length_m[w] = lengths[at]
-    turns.periodic[w] = energy[at] / (bank.shape[1] * pending[0] * total)
+    turns.periodic[w] = energy[at] / (bank.shape[1] * pending_m * total)
     if 0 < at < lengths.size - 1:  # the parabola through the best and its neighbours
         bend = energy[at - 1] - 2 * energy[at] + energy[at + 1]
         if bend < 0:
@@ -334,7 +372,7 @@ def _set_turns(s: float, turns: _Turns) -> None:
 
     They are computed by the series of an eighth of the angle, which vectorises, and doubled three times: error 1e-10.
     """
-    cosine, sine = turns.work[0], turns.work[1]
+    cosine, sine = turns.trials.cosine, turns.trials.sine
     for c in range(cosine.size):
         turn = s / turns.lengths_m[c]
         angle = (turn - math.floor(turn + 0.5)) * (math.pi / 4)
@@ -363,39 +401,40 @@ def _strength(j: int, channels: _Channels) -> float:
 
 
 @routine
-def _strangeness(loudest: float, channels: _Channels) -> float:
+def _strangeness(loudest: float, channels: _Channels, limits: _Limits) -> float:
     """Strength of the noise at a sensor over the most that a wheel can have there, at the sensor with the highest."""
     highest = 0.0
     for j in range(channels.strength.shape[0]):
         error = channels.error[j]
-        low, high = channels.neighbours[j]
+        low, high = limits.beside[j]
         if low < 0:
             continue
-        most = channels.limits[j, 1] * (_strength(low, channels) + _strength(high, channels))
-        most = min(most, channels.limits[j, 0] * loudest)
+        most = limits.rise[j] * (_strength(low, channels) + _strength(high, channels))
+        most = min(most, limits.loudness[j] * loudest)
         least = MIN_STRANGE * (error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
         highest = max(highest, _strength(j, channels) / max(most, least))
     return highest
 
 
 @routine
-def _subtract_noise(x: Floats, step: float, locked_m: float, loudest: float, channels: _Channels) -> int:
-    """Take the predicted noise out of a block (S, 3), less where it is weak; returns the channels that are far off.
+def _set_gate(step: float, strangeness: float, progress: _Progress) -> None:
+    """Fade what is taken out, away while what was learnt cannot be a wheel's.
 
-    Nothing is taken out while what was learnt cannot be a wheel's: it is then also of the magnets of a line, as far
-    apart as a turn is long.
+    It is then also of the magnets of a line, as far apart as a turn is long.
     """
-    share = min(step / STRENGTH_M, 1.0)
-    fade = min(max((locked_m - FADE_AFTER_M) / FADE_M, 0.0), 1.0)
-    outliers = 0
-    strangeness = _strangeness(loudest, channels)
     if strangeness > 1:
-        channels.gate[0] = 1.0
+        progress.is_strange = True
     elif strangeness < GATE_OPENS:
-        channels.gate[0] = 0.0
-    move = step / GATE_M if channels.gate[0] == 0 else -step / GATE_M
-    channels.gate[1] = min(max(channels.gate[1] + move, 0.0), 1.0)
-    fade *= channels.gate[1]
+        progress.is_strange = False
+    move = -step / GATE_M if progress.is_strange else step / GATE_M
+    progress.gate = min(max(progress.gate + move, 0.0), 1.0)
+
+
+@routine
+def _subtract_noise(x: Floats, step: float, fade: float, loudest: float, channels: _Channels) -> int:
+    """Take the predicted noise out of a block (S, 3), less where it is weak; returns the channels that are far off."""
+    share = min(step / STRENGTH_M, 1.0)
+    outliers = 0
     for j in range(x.shape[0]):
         wheel = fade if _strength(j, channels) < MAX_LOUDNESS * loudest else 0.0
         for axis in range(3):

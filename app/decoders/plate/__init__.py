@@ -1,3 +1,8 @@
-"""Camera frame to readings of coded plates: `reader.decode_plates`."""
+"""Camera frame to readings of coded plates: `reader.decode_plates`.
+
+A value without a source beside it was chosen by hand. `python -m benchmarks.plates` checks all of them together: frames
+that are read, digits that are wrong, positions and times. `python -m benchmarks.plates.thresholds` takes the thresholds
+of acceptance out one by one.
+"""
 
 DECODER_VERSION = "plate/7"

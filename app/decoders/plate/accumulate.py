@@ -37,21 +37,19 @@ CORRELATION = 0.6
 Source: `python -m benchmarks.video` prints the median over pairs of frames, of the residuals of the true units,
 whitened by the model: 0.4 to 0.8, more where units are large and compression is weak."""
 MAX_ODD_UNITS = 0.1
-"""[1] share of the units by which frames that show the same may differ. Source: chosen by hand; a grid that is off by
-a unit differs in half of them."""
+"""[1] share of the units by which frames that show the same may differ. A grid that is off by a unit differs in half of
+them."""
 MAX_FRAMES = 16
-"""[frames] of one plate that are added up, those with the largest units. Source: chosen by hand: more frames than that
-count as hardly more."""
+"""[frames] of one plate that are added up, those with the largest units. More frames than that count as hardly more."""
 OUT_OF_VIEW = PlateOutcome.FEWER_THAN_FOUR_VERTICES
 """Frames that show a part of the plate count only where no frame shows all of it."""
 _COLOUR_OUTCOMES = (PlateOutcome.RED_MARKER_MISSING, PlateOutcome.GREEN_MARKER_MISSING)
 RESOLVED_UNIT_PX = 6.0
-"""[px] size of a unit from which on larger ones show no more of it. Source: chosen by hand."""
+"""[px] size of a unit from which on larger ones show no more of it."""
 MISSING_SHARE = 0.5
-"""[1] share of the nearer half of the frames that must lack a part of a plate for it to be missing. Source: chosen by
-hand."""
+"""[1] share of the nearer half of the frames that must lack a part of a plate for it to be missing."""
 FIXED = 1e-4
-"""[contrast] spread of the joint contrast, which is 1 by construction. Source: chosen by hand."""
+"""[contrast] spread of the joint contrast, which is 1 by construction."""
 Array = npt.NDArray[Any]
 
 

@@ -21,11 +21,9 @@ from app.markers.reading import PlateOutcome, PlateReading
 Array = npt.NDArray[Any]
 
 CLEAN, STAINED, STAINED_SHARE = (1e-4, 1e-5), (0.1, 0.05), 0.02
-"""[probability] of a smooth stain and of a spot on a unit of a clean and of a stained plate, and of a stained plate.
-Source: chosen by hand."""
+"""[probability] of a smooth stain and of a spot on a unit of a clean and of a stained plate, and of a stained plate."""
 OVERLAP = 4.0
-"""[units] that share most of their pixels: the evidence of all units for stains counts one in so many. Source: by
-hand."""
+"""[units] that share most of their pixels: the evidence of all units for stains counts one in so many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,11 +80,11 @@ MAX_JOINT_ERROR = 1e-5
 one plate are correlated, so the sum is overconfident; 62 of 120 stained drives in a trial, none of them wrong."""
 SAME_VIEW = 1.05
 """[1] ratio of the heights of a plate's image up to which two frames show the same: a standing vehicle's repeat their
-errors, and count as one. Source: chosen by hand."""
+errors, and count as one."""
 MAX_UNSEEN = 3
-"""[frames] after which a plate that was not seen is another one. Source: chosen by hand."""
+"""[frames] after which a plate that was not seen is another one."""
 CLOSE_CELLS = 3
-"""[cells] by which readings of one plate may differ. Source: chosen by hand; a stain covers one to three."""
+"""[cells] by which readings of one plate may differ. A stain covers one to three."""
 
 
 @dataclass(slots=True)

@@ -217,13 +217,13 @@ def _systematic(word: ReedSolomonWord, information: tuple[int, ...]) -> Array:
 
 
 TEMPER = 0.35
-"""[1] exponent of the tempered likelihood exp(-cost / 2): the model's errors are not independent. Source: chosen by
-hand; effect: `python -m benchmarks.plates.thresholds`."""
+"""[1] exponent of the tempered likelihood exp(-cost / 2): the model's errors are not independent. Effect: `python -m
+benchmarks.plates.thresholds`."""
 REGISTERED_CONFIDENCE = 0.9999
-"""[probability] of a registered plate that corrections reach. Source: chosen by hand, above `MIN_CONFIDENCE`."""
+"""[probability] of a registered plate that corrections reach. Above `MIN_CONFIDENCE`."""
 MAX_CODEBOOK_CHANGES, RIVAL_CELLS = 3, 3
 """[cells] by which a registered position plate may differ from what was read, and by how many more every other one
-must. Source: chosen by hand; plates within 500 m share most of their digits."""
+must. Plates within 500 m share most of their digits."""
 RISK_RESIDUALS = (0.025, 0.075, 0.125, 0.175, 0.215, 0.265, 0.35, 0.45)
 CELL_RISKS = (0.002, 0.013, 0.038, 0.07, 0.16, 0.17, 0.3, 0.4)
 """[contrast, probability] `UnitEvidence.level_residual` of a cell, and how often such a cell shows another symbol than
@@ -231,24 +231,24 @@ was built. Source: plates with Reed-Solomon checks in shade, glare, dirt and wea
 of `python -m benchmarks.plates schemes`."""
 RANDOM_PRIOR, UNCLEAN_RANDOM_PRIOR = 0.01, 1.0
 """[1] odds that a plate's symbols are random against that they are a codeword of a given scheme: on a plate whose image
-looks clean, and on others. Source: chosen by hand; no wrong reading in the same frames up to a confidence of 0.98."""
+looks clean, and on others. No wrong reading in the same frames up to a confidence of 0.98."""
 MAX_CHECKED_ERROR = 1e-4
 """[probability] of an error, random symbols being as likely as a codeword, below which checks confirm the digits
-whatever else the plate lacks. Source: the same frames, without a wrong reading up to 0.02; chosen by hand."""
+whatever else the plate lacks. Source: the same frames, without a wrong reading up to 0.02."""
 OUTLIER_CONFIDENCE = 0.97
-"""[probability] factor on a cell with an outlier among its units. Source: chosen by hand, so that one such cell alone
-falls below `MIN_CONFIDENCE`."""
+"""[probability] factor on a cell with an outlier among its units, so that one such cell alone falls below
+`MIN_CONFIDENCE`."""
 MAX_DAMAGE = 0.25
-"""[contrast x ratio] `UnitEvidence.damage` up to which digits without a check are returned. Source: chosen by hand;
-effect: `python -m benchmarks.plates.thresholds`."""
+"""[contrast x ratio] `UnitEvidence.damage` up to which digits without a check are returned. Effect: `python -m
+benchmarks.plates.thresholds`."""
 MAX_DECIMAL_COST = 12.0
-"""[cost] of reading letters as digits up to which a plate may be a decimal one. Source: chosen by hand."""
+"""[cost] of reading letters as digits up to which a plate may be a decimal one."""
 CHANCE_LOG_ODDS = math.log(1e6)
 """[log] number of look-alikes that a match with the codebook must beat. Source: decision record 0010, rule 6."""
 MIN_LIKELY = 0.5
 """[probability] from which an unsure codeword is the likely one. Source: it is likelier than all others together."""
 UNCERTAIN_CELL = 0.99
-"""[probability] of a cell below which it is uncertain. Source: chosen by hand."""
+"""[probability] of a cell below which it is uncertain."""
 
 
 @dataclass(frozen=True, slots=True)

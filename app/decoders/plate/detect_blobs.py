@@ -19,17 +19,16 @@ from app.compiled import ieee_kernel, ieee_loop, ieee_loop_kernel, kernel, step,
 
 
 BLOCK = 16
-"""[pixels of the signal] side of a block, for which one threshold holds. Source: chosen by hand."""
+"""[pixels of the signal] side of a block, for which one threshold holds."""
 DIFFERENCE_LEVELS = ((6, 2), (10, 5), (20, 11))
-"""[grey levels, 1/32 of the brightness] thresholds of the difference signal. Source: chosen by hand: a red marker
-beside brown soil needs a high one to stand alone, a small one far away a low one to be seen at all."""
+"""[grey levels, 1/32 of the brightness] thresholds of the difference signal. A red marker beside brown soil needs a
+high one to stand alone, a small one far away a low one to be seen at all."""
 RATIO_LEVELS = ((6, 0), (14, 0))
-"""[1/128 of a natural logarithm, none] thresholds of the ratio signal. Source: chosen by hand."""
+"""[1/128 of a natural logarithm, none] thresholds of the ratio signal."""
 COARSE_RATIO_LEVELS = ((3, 0), (7, 0))
 """The same at a quarter of the resolution, where noise is half. Source: half of `RATIO_LEVELS`."""
 NOISE_FACTOR = 3.5
-"""[1] threshold over the mean difference of neighbours around a block, which foliage and grass have everywhere. Source:
-chosen by hand."""
+"""[1] threshold over the mean difference of neighbours around a block, which foliage and grass have everywhere."""
 
 Array = npt.NDArray[Any]
 Grey = npt.NDArray[np.uint8]
@@ -204,13 +203,13 @@ Marks = npt.NDArray[np.int8]
 Words = npt.NDArray[np.uint64]
 
 MAX_BLOBS = 6000
-"""[blobs] of all levels; more are left out. Source: chosen by hand, for speed."""
+"""[blobs] of all levels; more are left out. For speed."""
 MAX_RUNS = 60_000
-"""[runs] of one level; more are left out. Source: chosen by hand, for speed."""
+"""[runs] of one level; more are left out. For speed."""
 WORD = 8
 """[pixels] that are looked at in one step where they are all alike: bytes of an unsigned 64-bit word."""
 MIN_AREA = 2
-"""[pixels of the signal] of a blob. Source: chosen by hand."""
+"""[pixels of the signal] of a blob."""
 PIXEL_VARIANCE = 1.0 / 12
 """[px^2] variance of a pixel's own square. Source: that of the uniform distribution."""
 

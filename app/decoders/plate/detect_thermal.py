@@ -22,33 +22,31 @@ Array = npt.NDArray[Any]
 
 TRAILS_PX = (0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0, 11.0)
 """[px] trails that are tried. Source: 6 to 12 ms at 10 to 30 km/h are 17 to 100 mm, that is 0.8 to 12 px on plates of
-16 to 40 rows; chosen by hand."""
+16 to 40 rows."""
 FIRST_TRAILS = (3, 0, 6)
-"""Of these, by their places, those in which plates are searched for. Source: chosen by hand."""
+"""Of these, by their places, those in which plates are searched for."""
 CLEAR_EXPLAINED = 0.85
-"""[1] share of the variance from which a fit is a plate, and no other one is searched for in its place. Source: chosen
-by hand."""
+"""[1] share of the variance from which a fit is a plate, and no other one is searched for in its place."""
 STRETCH_PERCENT = (0.005, 99.995)
-"""[%] of the pixels of a sharpened frame that become 0 and 255. Source: chosen by hand."""
+"""[%] of the pixels of a sharpened frame that become 0 and 255."""
 MAX_QUADS = 8
-"""[candidates] of a frame. Source: chosen by hand, for speed."""
+"""[candidates] of a frame. For speed."""
 MIN_EXTENT_PX = 8.0
 """[px] least width and height of a warm region. Source: one pixel a unit on 8 x 8."""
 MIN_FILL, MAX_FILL = 0.45, 1.6
-"""[1] share of a quadrangle that the hull of its warm region fills at least, and at most. Source: chosen by hand."""
+"""[1] share of a quadrangle that the hull of its warm region fills at least, and at most."""
 MIN_CONTOUR, MIN_AREA_PX2 = 12, 40
-"""[points, px^2] least length and area of a warm region's outline. Source: chosen by hand."""
+"""[points, px^2] least length and area of a warm region's outline."""
 MIN_CONTRAST = 6.0
-"""[grey levels] least warmth above the road. Source: chosen by hand."""
+"""[grey levels] least warmth above the road."""
 SAME_PLACE, SAME_SIZE = 0.1, 0.2
-"""[extent, 1] distance and relative difference in size of quadrangles that are one. Source: chosen by hand."""
+"""[extent, 1] distance and relative difference in size of quadrangles that are one."""
 SHARES = (0.3, 0.5)
-"""[strongest warmth] levels at which regions are cut out. Source: chosen by hand."""
+"""[strongest warmth] levels at which regions are cut out."""
 CLOSINGS = (1, 3, 7, 15, 27)
-"""[px] diameters of the closings that join warm units. Source: chosen by hand, about the pitch of units on plates of 16
-to 200 px."""
+"""[px] diameters of the closings that join warm units. About the pitch of units on plates of 16 to 200 px."""
 ORIENTATION_EVIDENCE = 12.0
-"""[log likelihood] by which the best orientation must exceed the next. Source: chosen by hand; effect: `python -m
+"""[log likelihood] by which the best orientation must exceed the next. Effect: `python -m
 benchmarks.plates.thresholds`."""
 MIN_MISFIT_RATIO = 1.3
 """[1] unexplained variance of the next orientation over that of the best: errors of pixels are not independent. Source:

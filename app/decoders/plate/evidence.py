@@ -20,17 +20,16 @@ from app.markers.reading import PlateOutcome, PlateReading
 MIN_CONFIDENCE = 0.9995
 """[probability] from which digits are returned. Source: no wrong digits (decision record 0010, rule 5)."""
 MIN_EXPLAINED_ALONE = 0.83
-"""[1] the same for digits that no registry confirms. Source: chosen by hand; effect: `python -m
-benchmarks.plates.thresholds`."""
+"""[1] the same for digits that no registry confirms. Effect: `python -m benchmarks.plates.thresholds`."""
 MIN_EXPLAINED_SMALL, SMALL_UNIT_PX = 0.9, 2.5
-"""[1, px] the same on units below this size, where a misplaced grid explains nearly as much. Source: chosen by hand;
-effect: `python -m benchmarks.plates.thresholds`."""
+"""[1, px] the same on units below this size, where a misplaced grid explains nearly as much. Effect: `python -m
+benchmarks.plates.thresholds`."""
 MIN_ROWS_ALONE = 1.25
 """[px] height of a unit in the image for digits that neither a check of 16 bits nor a registry confirms. Source: frames
 of `python -m benchmarks.plates trials` of 10 to 12 rows: below it the units are rarely sure."""
 CLEAN_EXPLAINED = 0.93
-"""[1] share of variance from which a word may be corrected without a registry. Source: chosen by hand; effect: `python
--m benchmarks.plates.thresholds`."""
+"""[1] share of variance from which a word may be corrected without a registry. Effect: `python -m
+benchmarks.plates.thresholds`."""
 MAX_ERROR = 1e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
 stains and in fair light (decision record 0011)."""
@@ -48,7 +47,7 @@ PLAIN_GAP, GAP_UNIT_PX = 0.8, 3.0
 """[light units, px] light of gaps above which light paint does not show on them, so that pixels are compared, and size
 of a unit from which on they are: on smaller ones they show too little to confirm anything. Source: the same trials."""
 MIN_CHECKED_CELL = 0.5
-"""[probability] of a cell by the pixels below which a check that holds does not count. Source: chosen by hand."""
+"""[probability] of a cell by the pixels below which a check that holds does not count."""
 VERIFIED_UNIT_PX, PLAIN_SMALL_RESIDUAL = 2.0, 0.12
 """[px, contrast] size of a unit below which pixels show few stains, and the residual that is usual there. Source: the
 same trials: with the residual of larger units 36 of 49 plates of 11 to 24 rows are left, with this one 47."""
@@ -57,8 +56,7 @@ MAX_TENTATIVE_ERROR, TENTATIVE_CONFIDENCE, TENTATIVE_EXPONENT = 0.1, 0.9, 2.0
 that its confidence is, and how often the probability of no error by the pixels counts. Source: of 125 tentative
 readings 94, 89, 92 and 78 % are right at an error of up to 1e-3, 0.01, 0.03 and 0.1 by the pixels (record 0011)."""
 SURE_CELL = 0.9
-"""[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`. Source: chosen by
-hand."""
+"""[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`."""
 Array = npt.NDArray[Any]
 Verify = Callable[[PlateCode], UnitVerification | None]
 """Compares the pixels of a plate with a code; None where it has too few."""

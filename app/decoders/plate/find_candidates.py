@@ -27,15 +27,15 @@ Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 
 UNIT_REACH = 0.3
-"""[units] from a unit's centre to the four points that are sampled around it. Source: chosen by hand: well inside of
-the unit, although the first homography errs by a tenth of one."""
+"""[units] from a unit's centre to the four points that are sampled around it. Well inside of the unit, although the
+first homography errs by a tenth of one."""
 ROAD_OFFSET = 0.08
-"""[plate sides] outside of the plate's edge where the road is sampled. Source: chosen by hand: three units of blur."""
+"""[plate sides] outside of the plate's edge where the road is sampled. Three units of blur."""
 ROAD_POINTS = 6
-"""[points] of the road along each side. Source: chosen by hand."""
+"""[points] of the road along each side."""
 WORN_RATIO = 0.95
-"""[1] usual measured distance of marker centres over a marker's side, over `MARKER_RATIO`. Source: chosen by hand: blur
-makes markers larger."""
+"""[1] usual measured distance of marker centres over a marker's side, over `MARKER_RATIO`. Blur makes markers
+larger."""
 MIN_DEPTH = 1e-9
 """[1] denominator of a homography below which the plate is not in front of the camera. Source: rounding."""
 FEATURES = (
@@ -50,8 +50,7 @@ square of the logarithm by which the markers are too small or large; whether all
 (BEST_MARGIN, WEAKEST_TINT, SECOND_TINT, BEST_TINT, BLUE_CAST, RED_CAST, RANK, CONTRAST, UNIFORMITY, TWO_LEVELS, ROAD,
  SIZE, SIZE2, SIDE_RATIO, ALL_SQUARES) = range(3, len(FEATURES))  # fmt: skip
 MAX_RANK, USUAL_SIZE = 12.0, 3.5
-"""[log odds, log10 px^2] rank above which none counts more, and size about which the squares are taken. Source: chosen
-by hand."""
+"""[log odds, log10 px^2] rank above which none counts more, and size about which the squares are taken."""
 MIN_LOG_ODDS = -5.0
 """[log odds] below which a candidate is not fitted. Source: decision record 0010."""
 WEIGHTS = np.array(
@@ -372,13 +371,13 @@ def _set_features(view: _View, layout: _Layout, centroids_px: Floats, features: 
 SIGNALS = (difference_signal, ratio_signal, coarse_ratio_signal)
 """Signals that are searched, one after the other until a plate is read. Source: decision record 0010."""
 MAX_FITS = 5
-"""[candidates] that are fitted for one signal. Source: chosen by hand, for speed."""
+"""[candidates] that are fitted for one signal. For speed."""
 LOG_ODDS_RANGE = 4.0
-"""[log odds] by which a candidate may miss the limit under the first geometry, so that the others are tried. Source:
-chosen by hand, for speed: the colours are the same under all of them."""
+"""[log odds] by which a candidate may miss the limit under the first geometry, so that the others are tried. For speed:
+the colours are the same under all of them."""
 SIZE_MISFIT_RANGE = (-0.4, 0.55)
-"""[log] measured over usual size of the markers of a geometry that is tried. Source: chosen by hand; wear and blur
-change the size of markers."""
+"""[log] measured over usual size of the markers of a geometry that is tried. Wear and blur change the size of
+markers."""
 
 
 @dataclass(frozen=True, slots=True)

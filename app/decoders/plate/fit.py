@@ -128,38 +128,36 @@ def corner_jacobian(pose: PlaneArray, frame: PlaneArray, corners_px: PlaneArray)
 
 
 BLUR_PRIOR = (math.log(0.7), 0.35)
-"""[log px] mean and standard deviation of the lens blur's logarithm. Source: chosen by hand; the simulated cameras have
-0.4 to 1.2 px (`simulation.conditions`)."""
+"""[log px] mean and standard deviation of the lens blur's logarithm. The simulated cameras have 0.4 to 1.2 px
+(`simulation.conditions`)."""
 MOTION_PRIOR = (0.001, 0.0045)
-"""[plate sides^2] mean and standard deviation of the square of the motion's length. Source: chosen by hand; 50 km/h at
-1/500 s are 0.028 m, 0.007 plate sides squared."""
+"""[plate sides^2] mean and standard deviation of the square of the motion's length. 50 km/h at 1/500 s are 0.028 m,
+0.007 plate sides squared."""
 MIN_COARSE_EXPLAINED = (0.3, 0.74, 0.8, 0.83, 0.85, 0.85)
 """[1] share of the pixels' variance that the best values explain in each of the first steps on anything that is a
-plate. Source: chosen by hand."""
+plate."""
 MIN_FINE_EXPLAINED = 0.7
-"""[1] the same of the values and the pose found, from the second fine step on. Source: chosen by hand."""
+"""[1] the same of the values and the pose found, from the second fine step on."""
 MAX_STEP = 0.06
 """[extent of the plate's image] by which a step may move a corner. Source: decision record 0010, rule 3."""
 NEAR, LOST = 0.02, 0.03
-"""[extent of the plate's image] corners that move less are near rest; that move more in the last coarse step, lost.
-Source: chosen by hand."""
+"""[extent of the plate's image] corners that move less are near rest; that move more in the last coarse step, lost."""
 REST_PX = 0.25
-"""[px] corners rest when they move less in one step. Source: chosen by hand."""
+"""[px] corners rest when they move less in one step."""
 MIN_EXTENT_PX, MAX_EXTENT_PX = 3.0, 1.0e5
-"""[px] width and height of a plate's image beyond which the steps have left it. Source: chosen by hand."""
+"""[px] width and height of a plate's image beyond which the steps have left it."""
 VALUE_PRIOR_SPREAD = 1.2
-"""[mean light of the units] standard deviation of a shape's light about it. Source: chosen by hand."""
+"""[mean light of the units] standard deviation of a shape's light about it."""
 POSE_RIDGE = 1e-6
-"""[residual variance] added to the homography's diagonal, for a factor that exists. Source: chosen by hand."""
+"""[residual variance] added to the homography's diagonal, for a factor that exists."""
 FLAT_NOISE = 0.02
-"""[variance of the plate's light] noise that the first step assumes, before there is a residual. Source: chosen by
-hand."""
+"""[variance of the plate's light] noise that the first step assumes, before there is a residual."""
 MAX_BLUR_STEP = 0.4
-"""[log px] by which a step may change the lens blur. Source: chosen by hand."""
+"""[log px] by which a step may change the lens blur."""
 MAX_MOTION2_STEP = 0.01
-"""[plate sides^2] by which a step may lengthen the motion's square. Source: chosen by hand."""
+"""[plate sides^2] by which a step may lengthen the motion's square."""
 PATCH_MARGIN = 0.03
-"""[plate sides] around the plate from which pixels are used, and two pixels more. Source: chosen by hand."""
+"""[plate sides] around the plate from which pixels are used, and two pixels more."""
 GREY_LEVEL = 1.0 / 255
 """[light] least residual. Source: one level of 8 bits."""
 
@@ -365,11 +363,11 @@ def minimize(patch: PlatePatch, model: PlateModel, equations: NormalEquations, s
 Array = npt.NDArray[Any]
 
 FIRST_BLUR = 0.2
-"""[units] blur to begin with. Source: chosen by hand: an edge is then felt from half a unit away."""
+"""[units] blur to begin with. An edge is then felt from half a unit away."""
 FIRST_BLUR_PX = (0.7, 2.5)
-"""[px] least and greatest blur to begin with. Source: chosen by hand."""
+"""[px] least and greatest blur to begin with."""
 CORNER_SCATTER = 3.0
-"""[1] variance of the corners over that of even, independent noise: JPEG, optics, worn edges. Source: chosen by hand;
+"""[1] variance of the corners over that of even, independent noise: JPEG, optics, worn edges.
 `tests/decoders/plate/test_pose.py` checks the covariances of poses that follow."""
 FINE_CORNER_SCATTER = 4.5
 """[1] the same where more pixels are used: neighbours share the errors of the colour mosaic, of sharpening and of JPEG.

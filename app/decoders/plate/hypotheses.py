@@ -29,19 +29,17 @@ Array = npt.NDArray[np.float64]
 GAMMA = 2.2
 """[1] exponent from encoded values to linear light. Source: close to sRGB, IEC 61966-2-1, without its linear toe."""
 MIN_STEP_PX = 1.25
-"""[px] below which pixels are not averaged. Source: chosen by hand: resampling by so little costs more than it
-saves."""
+"""[px] below which pixels are not averaged. Resampling by so little costs more than it saves."""
 PATCH_PAD = 0.15
-"""[extent of the plate's image] cut out around it, so that the corners may move. Source: chosen by hand."""
+"""[extent of the plate's image] cut out around it, so that the corners may move."""
 MIN_PATCH_EXTENT_PX = 3.0
-"""[px] least width and height of a plate's image. Source: chosen by hand."""
+"""[px] least width and height of a plate's image."""
 MAX_TURNED = 1.5
-"""[1] factor by which a turned plate's bounding box is cut finer: root of its area over the plate's. Source: chosen by
-hand."""
+"""[1] factor by which a turned plate's bounding box is cut finer: root of its area over the plate's."""
 MIN_PATCH_PX = 4
-"""[px] least side of an averaged patch. Source: chosen by hand."""
+"""[px] least side of an averaged patch."""
 MIN_WEIGHT_LEVEL = 0.18
-"""[encoded level] below which noise in the dark, not the gamma, sets a pixel's weight. Source: chosen by hand."""
+"""[encoded level] below which noise in the dark, not the gamma, sets a pixel's weight."""
 _LEVELS = np.linspace(0.0, 1.0, 256)
 _LIGHT = (_LEVELS**GAMMA).astype(np.float32)
 _LINEAR = _LEVELS.astype(np.float32)
@@ -138,15 +136,15 @@ class Spots(NamedTuple):
 
 STAIN_LENGTH_MM, STAIN_REACH_MM, STAIN_SPREAD = 12.0, 27.0, 0.45
 """[mm, mm, 1] length over which a smooth stain changes, how far around the unit's centre it reaches, and its standard
-deviation relative to the light. Source: chosen by hand."""
+deviation relative to the light."""
 MIN_PIXELS = 4
-"""[pixels] around a unit below which nothing is compared: both of its values are as likely. Source: chosen by hand."""
+"""[pixels] around a unit below which nothing is compared: both of its values are as likely."""
 MIN_UNIT_SHARE, MOST_UNITS = 0.003, 9
-"""[1, units] share of a unit in a pixel below which it is left out, and units of a pixel at most. Source: by hand."""
+"""[1, units] share of a unit in a pixel below which it is left out, and units of a pixel at most."""
 EDGE_SLOPE = 1.702
 """[1] slope of the logistic function that is nearest to the normal distribution's."""
 MAX_DECAY = 40.0
-"""[1] exponent beyond which an exponential counts as that of this. Source: chosen by hand."""
+"""[1] exponent beyond which an exponential counts as that of this."""
 MIN_PIVOT = 1e-7
 """[1] square of a diagonal entry of a factor at least, relative to the light. Source: rounding of single precision."""
 Singles = npt.NDArray[np.float32]

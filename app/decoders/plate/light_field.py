@@ -25,26 +25,25 @@ from app.markers.plate import unit_index
 Array = npt.NDArray[Any]
 
 KNOT_MM = 20.0
-"""[mm] distance of the knots between which the light is linear. Source: chosen by hand."""
+"""[mm] distance of the knots between which the light is linear."""
 LIGHT_LENGTH_MM, LEVEL_VARIANCE = 120.0, 0.25
-"""[mm, 1] distance over which the correlation of the light falls to 1/e, and the variance of its mean, relative.
-Source: chosen by hand."""
+"""[mm, 1] distance over which the correlation of the light falls to 1/e, and the variance of its mean, relative."""
 LIGHT_SPREAD, SPREAD_FACTOR = (0.15, 0.45), 1.6
 """[1] least and greatest standard deviation of the light over a plate, relative, and the factor on that of the fitted
-light. Source: chosen by hand."""
+light."""
 MODEL_ERROR = 0.04
 """[1] error of the model relative to the light. Source: trials; the squared residuals over the variance are then 0.4 to
 1 in shade, and up to 1.6 under stains."""
 EDGE_ERROR = 0.03
-"""[white] error of the model where reflectances meet, whose blur is not known to less. Source: chosen by hand."""
+"""[white] error of the model where reflectances meet, whose blur is not known to less."""
 FIRST_NOISE = 0.03
-"""[light] noise that the first of the rounds assumes. Source: chosen by hand."""
+"""[light] noise that the first of the rounds assumes."""
 ROUNDS = 3
-"""Rounds of the light and the reflectances in turn. Source: chosen by hand."""
+"""Rounds of the light and the reflectances in turn."""
 MIN_LIGHT = 0.02
-"""[level] light on any pixel at least. Source: chosen by hand."""
+"""[level] light on any pixel at least."""
 MAX_ALBEDO = 1.4
-"""[white] greatest reflectance of a part. Source: chosen by hand."""
+"""[white] greatest reflectance of a part."""
 NEAR_KNOTS = 3
 """[knots] rows and columns within which the knots before one are those near it. Source: the field then differs from
 that of the whole covariance by less than 0.4 % of the light on 13 plates in shade."""
@@ -53,9 +52,9 @@ ROWS = 4
 NORMAL_SPREAD = 1.4826
 """[1] standard deviation of a normal distribution over the median of its absolute values."""
 MIN_ERROR = 1e-4
-"""[light] error of a pixel at least. Source: chosen by hand."""
+"""[light] error of a pixel at least."""
 ALBEDO_WEIGHT = 0.05
-"""[pixels] that the first reflectances count as. Source: chosen by hand."""
+"""[pixels] that the first reflectances count as."""
 
 
 class LightField(NamedTuple):
@@ -309,8 +308,8 @@ def _fit_field(pixels: PlatePixels, white: ProfilesFloats, parts: ProfilesFloats
 
 
 DARK_SHARE = 0.12
-"""[light level] light of dark units without haze: what they have beyond it is taken for haze. Source: chosen by hand;
-the simulated plates (`simulation.plate_face.draw_look`) have 0.02 to 0.2."""
+"""[light level] light of dark units without haze: what they have beyond it is taken for haze. The simulated plates
+(`simulation.plate_face.draw_look`) have 0.02 to 0.2."""
 VEIL_LENGTH = 2.0
 """[units of 8] length over which a veil changes: 80 mm, several units, where spots of paint have 8 to 30 mm. Source:
 the standard deviation of the simulated glare is 50 to 500 mm (`simulation.conditions`)."""
@@ -318,21 +317,20 @@ VEIL_SPREADS = (0.1, 0.3)
 """[light level] standard deviations of a veil, each as likely. Source: the simulated glare adds 0.05 to 0.35."""
 LIGHT_SPREADS, LIGHT_LENGTH = (0.1, 0.25, 0.5), 4.0
 """[1, units of 8] standard deviations of uneven light, relative, each as likely, and distance over which its
-correlation falls to 1/e. Source: fair light, shade and deep shade, chosen by hand."""
+correlation falls to 1/e. Source: fair light, shade and deep shade."""
 LEVEL_SPREAD, HAZE_SPREAD = 0.5, 0.3
-"""[1, light level] standard deviations of the light and of the haze over the whole plate, which leave both open.
-Source: chosen by hand."""
+"""[1, light level] standard deviations of the light and of the haze over the whole plate, which leave both open."""
 LIGHT_WEAR, DARK_WEAR = 0.09, 0.05
 """[light level] standard deviations of what light and dark units differ by themselves. Source: as
 `unit_likelihoods.WHITE_SPREAD`."""
 VEIL_PRIOR = 0.05
-"""[probability] of a veil. Source: chosen by hand."""
+"""[probability] of a veil."""
 SEARCH_SPREAD, SEARCH_WEAR = 0.3, 0.12
 """[span] standard deviations of the veil and of what units differ by themselves, while the pattern under a veil is
-searched. Source: chosen by hand."""
+searched."""
 CONTRAST, CONTRAST_SPREAD = 0.85, 0.25
 """[span] expected difference of light and dark units, and its standard deviation: glare adds to the light of the
-lightest. Source: chosen by hand."""
+lightest."""
 
 
 class Veil(NamedTuple):

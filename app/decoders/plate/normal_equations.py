@@ -141,11 +141,10 @@ def invert(matrix: Array) -> Array:
 
 
 ROAD_WEIGHT = 0.3
-"""[1] weight of a pixel of the road against one of the plate: four values cannot explain a road. Source: chosen by
-hand."""
+"""[1] weight of a pixel of the road against one of the plate: four values cannot explain a road."""
 ROAD_SPREAD = 0.1
 """[light] scale of the Cauchy weight 1 / (1 + r^2) of road pixels: what is further off, as a lane line, counts less.
-Source: chosen by hand; commit `a lane line beside a plate does not spoil its fit`."""
+Commit `a lane line beside a plate does not spoil its fit`."""
 
 
 class PatchArea(NamedTuple):

@@ -68,17 +68,16 @@ def unit_shapes(n: int) -> npt.NDArray[np.int64]:
 Array = npt.NDArray[Any]
 
 LEVEL_SPREAD_RAD = math.radians(0.4)
-"""[rad] standard deviation of a vehicle's roll and pitch relative to the road. Source: chosen by hand; the simulated
-vehicles have 0.15 degrees (`simulation.drive.Drive.sway_deg`)."""
+"""[rad] standard deviation of a vehicle's roll and pitch relative to the road. The simulated vehicles have 0.15 degrees
+(`simulation.drive.Drive.sway_deg`)."""
 HEIGHT_SPREAD_M = 0.02
-"""[m] standard deviation of a camera's height: springs, load. Source: chosen by hand."""
+"""[m] standard deviation of a camera's height: springs, load."""
 MIN_DEPTH_M = 0.05
-"""[m] depth of a plate in front of the camera. Source: chosen by hand."""
+"""[m] depth of a plate in front of the camera."""
 MAX_STEPS, REST = 6, 1e-7
-"""[steps; rad, m] of Gauss-Newton at most, and the step below which it ends. Source: chosen by hand."""
+"""[steps; rad, m] of Gauss-Newton at most, and the step below which it ends."""
 CORNER_FLOOR_PX = 0.05
-"""[px] standard deviation that is added to a corner's, for what the fit's covariance leaves out. Source: chosen by
-hand."""
+"""[px] standard deviation that is added to a corner's, for what the fit's covariance leaves out."""
 
 REDUNDANT = 5
 """[1] residuals beyond the unknowns: eight of the corners and three of the mount determine six."""
@@ -267,9 +266,9 @@ def fix_vehicle(
 
 
 MAX_SHUTTER_STEPS = 4
-"""[steps] of alternating between pose and corners. Source: chosen by hand; the third changes less than 0.01 px."""
+"""[steps] of alternating between pose and corners. The third changes less than 0.01 px."""
 REST_PX = 0.005
-"""[px] change of a corner below which the steps end. Source: chosen by hand."""
+"""[px] change of a corner below which the steps end."""
 
 
 def row_time_s(rows_px: Array, camera: Camera) -> Array:

@@ -15,29 +15,29 @@ from app.decoders.plate.pose import unit_shapes
 from app.markers.plate import PlateGeometry
 
 PX_PER_MM = 2.0
-"""[px/mm] of the rectified face. Source: chosen by hand: a gap of 2 mm has four pixels."""
+"""[px/mm] of the rectified face. A gap of 2 mm has four pixels."""
 CENTRE_SHARE = 0.5
-"""[units] side of the part of a unit whose median is its reflectance. Source: chosen by hand: a displaced, larger or
-blurred unit still fills it."""
+"""[units] side of the part of a unit whose median is its reflectance. A displaced, larger or blurred unit still fills
+it."""
 MIN_EDGE_CONTRAST = 0.25
-"""[contrast] of a unit and the gap, below which the edge between them is not measured. Source: chosen by hand: one of
-the two paints always has twice of it."""
+"""[contrast] of a unit and the gap, below which the edge between them is not measured. One of the two paints always has
+twice of it."""
 MERGED = 0.5
-"""[1] share of units that touch a neighbour from which the gaps count as closed. Source: chosen by hand."""
+"""[1] share of units that touch a neighbour from which the gaps count as closed."""
 CLIPPED_LEVEL = 251
-"""[grey level] from which a pixel counts as over-exposed. Source: chosen by hand: JPEG moves 255 by a few levels."""
+"""[grey level] from which a pixel counts as over-exposed. JPEG moves 255 by a few levels."""
 _LUMA = np.array([0.0722, 0.7152, 0.2126], np.float32)
 """Luminance of linear blue, green, red. Source: IEC 61966-2-1 with ITU-R BT.709."""
-_DARK_WEIGHT = 0.2  # of dark units in the light; source: chosen by hand: stray light adds to them
-_HUBER = 0.05  # [natural log] residual from which a unit counts less in the light; source: chosen by hand
-_LIGHT_STEPS = 12  # of reweighted least squares; source: chosen by hand, it settles after six
-_MAX_LIGHTS_FOR_LINEAR = 9  # light units up to which the light is linear; source: chosen by hand
-_EDGE_REACH = 0.6  # [units] beyond a gap in which an edge is looked for; source: chosen by hand
-_STEEPEST = 99.0  # percentile of the slopes; source: chosen by hand, edges of 0.3 mm cover more than a hundredth
-_MAX_OFF = 0.55  # [units] of an edge from its place; source: chosen by hand, more leaves the unit's centre uncovered
-_REFINEMENTS = 2  # of the homography by the units' edges; source: chosen by hand
-_MIN_CENTRES = 8  # measured units that refine the homography; source: chosen by hand
-_MAX_OFF_MM = 1.5  # [mm] of a unit that counts as in its place in the homography; source: chosen by hand
+_DARK_WEIGHT = 0.2  # of dark units in the light; stray light adds to them
+_HUBER = 0.05  # [natural log] residual from which a unit counts less in the light
+_LIGHT_STEPS = 12  # of reweighted least squares; it settles after six
+_MAX_LIGHTS_FOR_LINEAR = 9  # light units up to which the light is linear
+_EDGE_REACH = 0.6  # [units] beyond a gap in which an edge is looked for
+_STEEPEST = 99.0  # percentile of the slopes; edges of 0.3 mm cover more than a hundredth
+_MAX_OFF = 0.55  # [units] of an edge from its place; more leaves the unit's centre uncovered
+_REFINEMENTS = 2  # of the homography by the units' edges
+_MIN_CENTRES = 8  # measured units that refine the homography
+_MAX_OFF_MM = 1.5  # [mm] of a unit that counts as in its place in the homography
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]

@@ -32,18 +32,17 @@ from app.markers.reading import PlateReading
 
 
 DAMAGED = 0.3
-"""[contrast] by which a spot of a unit differs from the unit. Source: chosen by hand: above the noise and grain of a
-photo, below the least paint that turns a unit."""
+"""[contrast] by which a spot of a unit differs from the unit. Above the noise and grain of a photo, below the least
+paint that turns a unit."""
 DAMAGE_SHARE = 0.8
 """[units] side of the part of a unit that is searched for stains; its edges are those of the print growth."""
 NEARLY_WHOLE, WHOLE_UNIT, STAINED_GAP = 0.94, 0.985, 0.25
 """[units, 1, 1] side of a unit without its edges, share of it that counts as all of it, and share of the gaps around it
-that a stain covers too. Source: chosen by hand: a round stain leaves the corners free, or covers more than one gap."""
+that a stain covers too. A round stain leaves the corners free, or covers more than one gap."""
 MIN_WIDTHS = 3
-"""Units of a paint whose median is its width. Source: chosen by hand: one that is damaged has no say then."""
+"""Units of a paint whose median is its width. One that is damaged has no say then."""
 MARKER_REACH = 0.35
-"""[units] half side of the part of a marker whose colour is taken. Source: chosen by hand: half of the triangle's width
-about its centroid."""
+"""[units] half side of the part of a marker whose colour is taken. Half of the triangle's width about its centroid."""
 WHITE = 0.75
 """[1] reflectance of white paint as the decoder's trials have it. Source: `PlateLook.light` of
 app/simulation/plate_face.py."""
@@ -324,32 +323,32 @@ def _decode(evidence: PrintEvidence) -> PrintParameter:
 
 
 SEARCH_SIDE_PX = 1600
-"""[px] longest side of the reduced photo in which the plate is searched. Source: chosen by hand, for speed: a plate of
-24 rows there is far too small to be graded."""
+"""[px] longest side of the reduced photo in which the plate is searched. For speed: a plate of 24 rows there is far too
+small to be graded."""
 MIN_SIDE_PX = 400.0
-"""[px] least side of a plate that is graded. Source: chosen by hand: its gaps of 5 mm then have six pixels."""
+"""[px] least side of a plate that is graded. Its gaps of 5 mm then have six pixels."""
 MIN_GAP_PX = 4.0
-"""[px] least width of a gap, which narrow gaps need. Source: chosen by hand."""
+"""[px] least width of a gap, which narrow gaps need."""
 MAX_EDGE_GAPS = 0.8
-"""[gaps] widest edge, from 10 to 90 %: wider ones of neighbours run into each other. Source: chosen by hand."""
+"""[gaps] widest edge, from 10 to 90 %: wider ones of neighbours run into each other."""
 MAX_CLIPPED = 0.05
-"""[1] share of over-exposed pixels on the light units. Source: chosen by hand."""
+"""[1] share of over-exposed pixels on the light units."""
 MIN_WHITE_LEVEL = 70.0
-"""[grey level] least brightness of the light units. Source: chosen by hand: noise is 3 % of the white there."""
+"""[grey level] least brightness of the light units. Noise is 3 % of the white there."""
 MAX_LIGHT_RATIO = 2.0
-"""[1] brightest over darkest light on the plate. Source: chosen by hand."""
+"""[1] brightest over darkest light on the plate."""
 MAX_SHADED, SHADED_LEVEL = 0.25, 0.75
-"""[1] share of light units that may be darker than this share of the others, as in a shadow. Source: chosen by hand."""
+"""[1] share of light units that may be darker than this share of the others, as in a shadow."""
 MAX_TILT_DEG, MAX_TILT_ASSUMED_DEG = 30.0, 15.0
 """[deg] greatest tilt with the focal length of the photo's EXIF, and with an assumed one. Source: a focal length that
 is off by 15 % changes the ratio of the axes by 2 % at 15 degrees, a third of grade A's limit."""
 ASSUMED_FOCAL_35MM = 26.0
 """[mm] focal length on 36 mm film of a phone's main camera, 24 to 28. Source: makers' data sheets."""
 MIN_AGREEMENT = 0.75
-"""[1] share of units as expected in a plate that the decoder cannot read. Source: chosen by hand: of 48 units at
-random, 36 agree once in 2,800 times."""
+"""[1] share of units as expected in a plate that the decoder cannot read. Of 48 units at random, 36 agree once in 2,800
+times."""
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
-_MIN_CHROMA = 12  # [grey levels] of the most colourful hundredth of a photo; source: chosen by hand
+_MIN_CHROMA = 12  # [grey levels] of the most colourful hundredth of a photo
 
 Image = npt.NDArray[np.uint8]
 

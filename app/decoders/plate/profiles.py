@@ -23,8 +23,7 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 NORMAL_REACH = 4.25
-"""[standard deviations] end of the table of the normal distribution, beyond which 1e-5 of it lies. Source: chosen by
-hand."""
+"""[standard deviations] end of the table of the normal distribution, beyond which 1e-5 of it lies."""
 NORMAL_DENSITY = 128
 """[entries per standard deviation] of the table. Source: linear interpolation then errs by at most h^2 / 8 max |f''| =
 3e-6."""
@@ -33,10 +32,9 @@ NORMAL_TABLE = np.stack([[NormalDist().cdf(z) for z in _Z], np.exp(-0.5 * _Z**2)
 """Cumulative distribution and density of the standard normal distribution, shape (entries, 2)."""
 PROFILE_REACH = 3.0
 """[standard deviations] beyond which a unit's share of a point is left out. Source: 0.1 % of the normal distribution
-lie beyond it; chosen by hand."""
+lie beyond it."""
 SHORT_MOTION = 0.3
-"""[standard deviations] length of the motion below which it is replaced by a Gaussian of its variance, m^2 / 12.
-Source: chosen by hand."""
+"""[standard deviations] length of the motion below which it is replaced by a Gaussian of its variance, m^2 / 12."""
 
 
 class AxisProfiles(NamedTuple):
@@ -140,19 +138,18 @@ def set_profiles(x: float, blur: AxisBlur, edges: Floats, table: Floats, out: Ax
 
 UPRIGHT_SINE = 0.35
 """[1] sine of the angle between the blur's long axis and the plate's columns up to which the blur counts as lying along
-them. Source: 20 degrees, chosen by hand."""
+them. Source: 20 degrees."""
 ROUND_BLUR = 1.69
-"""[1] ratio of the blur's variances up to which it counts as round. Source: 1.3 squared, chosen by hand."""
+"""[1] ratio of the blur's variances up to which it counts as round. Source: 1.3 squared."""
 NODES_PER_RATIO = 1.2
-"""[1] quadrature nodes on each side of the middle per ratio of the blur's axes. Source: chosen by hand."""
+"""[1] quadrature nodes on each side of the middle per ratio of the blur's axes."""
 NODE_REACH = 2.2
-"""[standard deviations] of the outermost node. Source: chosen by hand."""
+"""[standard deviations] of the outermost node."""
 MIN_SKEW = 0.02
-"""[1] correlation of an upright plate's blur along its rows and columns that is left out. Source: chosen by hand; 0.6
-degrees on a blur five times as long as wide."""
+"""[1] correlation of an upright plate's blur along its rows and columns that is left out. 0.6 degrees on a blur five
+times as long as wide."""
 MIN_MOTION2 = 0.0004
-"""[plate sides^2] square of the motion that the quadrature allows for at least, so that its derivative is not zero.
-Source: chosen by hand."""
+"""[plate sides^2] square of the motion that the quadrature allows for at least, so that its derivative is not zero."""
 
 
 class Quadrature(NamedTuple):

@@ -38,10 +38,10 @@ SINGLES = 13
 FIRST_GAP, FIRST_ROAD = 5, 9
 """Places of the gaps' and the road's four values among these."""
 MIN_DEPTH = 0.05
-"""[depth of the plate's middle] below which a pixel is not used, clear of the horizon. Source: chosen by hand."""
+"""[depth of the plate's middle] below which a pixel is not used, clear of the horizon."""
 MIN_UNIT_SHARE, MIN_MARKER_SHARE, MIN_FIELD_SHARE = 1e-3, 1e-3, 1e-4
 """[share of a pixel] shapes with less are left out of its equation. Source: less than half of a grey level, 1 / 510."""
-_PRESENT = 1e-300  # [1] marks a shape as present before its share is added; source: by hand, almost 0
+_PRESENT = 1e-300  # [1] marks a shape as present before its share is added; almost 0
 
 
 class PlateModel(NamedTuple):

@@ -48,71 +48,69 @@ from app.markers.plate import PlateCode, PlateGeometry, unit_index
 Array = npt.NDArray[Any]
 
 CONTRAST = 2.0
-"""[log light] expected difference of light and dark units once haze is taken off. Source: chosen by hand, near ln(1 /
-light_field.DARK_SHARE) = 2.1."""
+"""[log light] expected difference of light and dark units once haze is taken off. Near ln(1 / light_field.DARK_SHARE) =
+2.1."""
 CONTRAST_SPREAD = 0.4
-"""[log light] standard deviation of that difference. Source: chosen by hand."""
+"""[log light] standard deviation of that difference."""
 LIGHT_SPREAD = 0.45
-"""[log light] standard deviation of the illumination over a few units. Source: chosen by hand."""
+"""[log light] standard deviation of the illumination over a few units."""
 LIGHT_LENGTH = 4.0
-"""[units of 8] distance over which the illumination's correlation falls to 1/e. Source: chosen by hand."""
+"""[units of 8] distance over which the illumination's correlation falls to 1/e."""
 MEAN_VARIANCE = 4.0
-"""[1] variance of the illumination's mean, which leaves it open. Source: chosen by hand."""
+"""[1] variance of the illumination's mean, which leaves it open."""
 WEAR = 0.16
-"""[log light] standard deviation of what units differ by themselves. Source: chosen by hand."""
+"""[log light] standard deviation of what units differ by themselves."""
 LEVELLED_LIGHT_SPREAD, LEVELLED_WEAR = 0.1, 0.1
-"""[light level] the same two on light whose illumination has been divided out. Source: chosen by hand."""
+"""[light level] the same two on light whose illumination has been divided out."""
 LEVELLED_CONTRAST_SPREAD = 0.3
-"""[contrast] standard deviation of the levelled contrast. Source: chosen by hand."""
+"""[contrast] standard deviation of the levelled contrast."""
 LOG_FLOOR = 0.05
-"""[light level] added before the logarithm, so that noise around black stays small. Source: chosen by hand."""
+"""[light level] added before the logarithm, so that noise around black stays small."""
 MAX_LOG_ODDS = 12.0
 """[log odds] of a veil against even haze, or the reverse, beyond which the other one does not count. Source: 6e-6, far
 below `evidence.MAX_ERROR`."""
 MIN_VEILED_RESIDUAL = 0.08
-"""[contrast] level residual under even haze from which on a veil of glare is compared. Source: chosen by hand, for
-speed, as `evidence.PLAIN_RESIDUAL`."""
+"""[contrast] level residual under even haze from which on a veil of glare is compared. For speed, as
+`evidence.PLAIN_RESIDUAL`."""
 RESIDUAL_TO_SPREAD = 1.4826
 """[1] standard deviation of a normal distribution over the median of its absolute values."""
 MIN_LEVEL_NOISE_RATIO = 4.0
-"""[standard deviations] by which the lightest units must stand above the darkest. Source: chosen by hand."""
+"""[standard deviations] by which the lightest units must stand above the darkest."""
 MIN_LIGHT = 1e-4
-"""[1 = saturation] below which there is no light to decode. Source: four grey levels of 255 at a gamma of 2.2, chosen
-by hand."""
+"""[1 = saturation] below which there is no light to decode. Source: four grey levels of 255 at a gamma of 2.2."""
 SCATTER_PRIOR = (8.0, 0.6)
-"""[units, 1] weight and value of the scatter that is expected against the model. Source: chosen by hand."""
+"""[units, 1] weight and value of the scatter that is expected against the model."""
 USUAL_BLUR_PX = 1.0
-"""[px] lens blur of a sharp camera. Source: chosen by hand; `simulation.conditions.draw_daylight` has 0.4 to 0.9."""
+"""[px] lens blur of a sharp camera. `simulation.conditions.draw_daylight` has 0.4 to 0.9."""
 FULL_WEIGHT_PX = 1.4
-"""[px] size of a unit in the image, in its usual blur, from which on its likelihood has full weight. Source: chosen by
-hand; effect: `python -m benchmarks.plates.thresholds`."""
+"""[px] size of a unit in the image, in its usual blur, from which on its likelihood has full weight. Effect: `python -m
+benchmarks.plates.thresholds`."""
 MAX_BLUR_UNITS = 0.6
 """[units] standard deviation of lens and motion blur together up to which likelihoods have full weight. Source: `python
 -m benchmarks.plates.thresholds`."""
 CELL_LIGHT_RANGE = (0.65, 1.5)
-"""[1] light on a cell of one level over that around it, beyond which it may be a stain. Source: chosen by hand; effect:
-`python -m benchmarks.plates.thresholds`."""
+"""[1] light on a cell of one level over that around it, beyond which it may be a stain. Effect: `python -m
+benchmarks.plates.thresholds`."""
 MAX_LEVEL_RESIDUAL = 0.23
-"""[contrast] distance of a unit from its level from which on it is an outlier, worn or stained. Source: chosen by hand;
-effect: `python -m benchmarks.plates.thresholds`."""
+"""[contrast] distance of a unit from its level from which on it is an outlier, worn or stained. Effect: `python -m
+benchmarks.plates.thresholds`."""
 MAX_LARGE_RESIDUAL, LARGE_UNIT_PX = 0.16, 3.0
-"""[contrast, px] the same on units of at least this size, whose own noise is smaller. Source: chosen by hand; effect:
-`python -m benchmarks.plates.thresholds`."""
+"""[contrast, px] the same on units of at least this size, whose own noise is smaller. Effect: `python -m
+benchmarks.plates.thresholds`."""
 MAX_RESIDUAL_SPREAD = 0.12
-"""[contrast x units] distance from the level times standard deviation of the blur, the same. Source: chosen by hand;
-effect: `python -m benchmarks.plates.thresholds`."""
+"""[contrast x units] distance from the level times standard deviation of the blur, the same. Effect: `python -m
+benchmarks.plates.thresholds`."""
 STAIN_UNIT_PX = 2.0
-"""[px] size of a unit from which on damage counts fully: smaller ones show less. Source: chosen by hand; effect:
-`python -m benchmarks.plates.thresholds`."""
+"""[px] size of a unit from which on damage counts fully: smaller ones show less. Effect: `python -m
+benchmarks.plates.thresholds`."""
 STAIN_DARK, STAIN_LIGHT = 0.07, 0.105
-"""[contrast] residual of a dark or light unit's pixels from which on it may be a stain. Source: chosen by hand."""
+"""[contrast] residual of a dark or light unit's pixels from which on it may be a stain."""
 MIN_OF_A_LEVEL = 6
-"""[units] light or dark ones from which on their median is the usual residual. Source: chosen by hand."""
+"""[units] light or dark ones from which on their median is the usual residual."""
 TAIL_SHARE = 1 / 8
-"""[1] share of the units whose mean is the lightest and the darkest level. Source: chosen by hand."""
+"""[1] share of the units whose mean is the lightest and the darkest level."""
 MIN_LEVEL_DIFFERENCE, ONE_LEVEL_DIFFERENCE = 0.1, 0.8
-"""[light level] least difference of the levels, and that which is assumed while one is missing. Source: chosen by
-hand."""
+"""[light level] least difference of the levels, and that which is assumed while one is missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -390,15 +388,15 @@ UNIT_PX = 4.5
 stained plates."""
 REACH_PITCHES = 1.25
 """[pitches] from a unit's centre within which its pixels are compared: the unit, the gaps around it and half of its
-neighbours. Source: chosen by hand, for speed."""
+neighbours. For speed."""
 INNER_SHARE = 0.7
-"""[unit] part of a unit's half side within which lies what the pixels around it see of it. Source: chosen by hand."""
+"""[unit] part of a unit's half side within which lies what the pixels around it see of it."""
 MAX_ROAD_SHARE, MIN_SHARE = 0.05, 0.9
-"""[1] share of the road in a pixel up to which it is compared, and of all shapes from which on. Source: by hand."""
+"""[1] share of the road in a pixel up to which it is compared, and of all shapes from which on."""
 ALBEDO = (0.01, 1.3)
-"""[white] least and greatest reflectance of a part to begin with. Source: chosen by hand."""
+"""[white] least and greatest reflectance of a part to begin with."""
 MIN_BLUR_MM = 2.0
-"""[mm] width of the edge of a spot of paint at least. Source: chosen by hand."""
+"""[mm] width of the edge of a spot of paint at least."""
 NODES = 4
 """Quadrature nodes on each side of the middle at most, as the fit has."""
 WHITE_SPREAD, SPREAD_FACTOR, DARK_SHARE_OF_SPREAD = (0.03, 0.09), 2.0, 0.55
@@ -406,13 +404,13 @@ WHITE_SPREAD, SPREAD_FACTOR, DARK_SHARE_OF_SPREAD = (0.03, 0.09), 2.0, 0.55
 `UnitEvidence.spread`, and that of dark units over it: where units are even, a spot of paint stands out. Source: plates
 under painted stains (decision record 0011)."""
 VEIL_ERROR = 0.05
-"""[light level] standard deviation of the error of a veil of glare. Source: chosen by hand; with none, 51 of 100
-frames in glare are read in place of 52 (decision record 0011)."""
+"""[light level] standard deviation of the error of a veil of glare. With none, 51 of 100 frames in glare are read in
+place of 52 (decision record 0011)."""
 SPOTS_MM = ((17, 17, 0), (22, 22, 0), (30, 30, 0), (26, 17, 0), (17, 26, 0), (28, 20, 45), (28, 20, 135))
-"""[mm, mm, deg] half axes and turns of the spots of paint; each lies at nine places around the unit's centre. Source:
-chosen by hand; smaller ones leave a part of the unit in view."""
+"""[mm, mm, deg] half axes and turns of the spots of paint; each lies at nine places around the unit's centre. Smaller
+ones leave a part of the unit in view."""
 PAINTS, OPACITIES = np.array([0.03, 0.1, 0.2, 0.35, 0.6, 0.85, 1.0, 1.15]), np.array([1.0, 0.8])
-"""[white, 1] reflectances and opacities of the spots. Source: chosen by hand."""
+"""[white, 1] reflectances and opacities of the spots."""
 
 
 def verify_units(

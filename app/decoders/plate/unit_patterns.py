@@ -16,11 +16,11 @@ Floats = npt.NDArray[np.float64]
 MIN_GAIN = 1e-9
 """[cost] by which a flip must lower the cost. Source: rounding."""
 MAX_PAIR_COST = 60.0
-"""[cost] of a single flip above which it is not tried in pairs. Source: chosen by hand, for speed."""
+"""[cost] of a single flip above which it is not tried in pairs. For speed."""
 ROUNDS = 12
-"""[rounds] of flips and contrast. Source: chosen by hand."""
+"""[rounds] of flips and contrast."""
 MIN_CONTRAST_SHARE = 0.25
-"""[expected contrast] least contrast. Source: chosen by hand."""
+"""[expected contrast] least contrast."""
 
 
 @ieee_routine

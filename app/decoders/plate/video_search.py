@@ -34,17 +34,16 @@ from app.sensors.camera import Camera
 
 
 MAX_UNSEEN_S = 0.8
-"""[s] after which a plate that was not seen is not expected any more. Source: chosen by hand; at 10 m/s a plate passes
-in about 1 s."""
+"""[s] after which a plate that was not seen is not expected any more. At 10 m/s a plate passes in about 1 s."""
 BEHIND_M = -2.0
-"""[m] ahead of the camera, where a plate is out of view of any camera that looks forward. Source: chosen by hand."""
+"""[m] ahead of the camera, where a plate is out of view of any camera that looks forward."""
 AHEAD_GATE_M, AHEAD_GATE_SHARE, LEFT_GATE_M, LEFT_GATE_SHARE = 0.5, 0.10, 0.35, 0.04
 """[m, 1] distance from the predicted place along and across up to which a candidate is the plate, and the same as a
-share of its distance. Source: chosen by hand: plates lie metres apart, and a pose from 16 rows is good to 5 %."""
+share of its distance. Plates lie metres apart, and a pose from 16 rows is good to 5 %."""
 MAX_SPEED_M_S = 90.0
-"""[m/s] of a vehicle whose speed is not known. Source: chosen by hand, 324 km/h."""
+"""[m/s] of a vehicle whose speed is not known. 324 km/h."""
 MIN_FIT_ADVANCE_M = 1.0
-"""[m] by which a plate must have come nearer for a speed to follow. Source: chosen by hand."""
+"""[m] by which a plate must have come nearer for a speed to follow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,19 +206,19 @@ class PlateTracker:
 
 SIZE_TOLERANCE = 1.8
 """[1] by which a candidate may differ from the sizes that plates have at its place: pitch of the body, slopes, and
-markers that are not all found. Source: chosen by hand."""
+markers that are not all found."""
 MARKER_SPAN = 0.75
 """[plate] distance between the centres of the markers, 1 - a cell of 8 x 8. Source: layout of the plate."""
 FRUITLESS = ((30, 3), (8, 2))
 """[frames] after so many decoded frames in a row without a plate, only every third or second one with candidates is
-decoded. Source: chosen by hand; a plate is in 9 frames at 30 m/s and 30 Hz."""
+decoded. A plate is in 9 frames at 30 m/s and 30 Hz."""
 STANDING_M_S, STANDING_STEP = 0.5, 10
-"""[m/s, frames] a vehicle that stands sees the same plate again; every tenth frame is decoded. Source: by hand."""
+"""[m/s, frames] a vehicle that stands sees the same plate again; every tenth frame is decoded."""
 RECENT_FRAMES = 8
-"""[frames] that are searched back for a plate that was found. Source: chosen by hand: at 25 m/s and 30 Hz the plate
-was 7 m further away then, where a unit has 1 px."""
+"""[frames] that are searched back for a plate that was found. At 25 m/s and 30 Hz the plate was 7 m further away then,
+where a unit has 1 px."""
 MIN_CLEAR_EXPLAINED, MIN_CLEAR_UNIT_PX = 0.85, 3.0
-"""[1, px] share of variance and size of a unit from which on a plate is followed back. Source: chosen by hand."""
+"""[1, px] share of variance and size of a unit from which on a plate is followed back."""
 MAX_CORRECTED = 1
 """[cells] that a check may correct without a registry. Source: one wrong plate of 164 in compressed videos
 (`python -m benchmarks.video --short --seed 101 --seeds 16 --crf 30`): compression spoils many units at once."""

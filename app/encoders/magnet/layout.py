@@ -22,9 +22,9 @@ from app.markers.reading import Check
 from app.roads.lane_line import FloatArray, LaneLine, bearing_deg, left_of
 
 MAX_HOLES = 10_000
-"""Magnets of a line at most. Source: chosen by hand, 60 km at 6 m."""
+"""Magnets of a line at most. 60 km at 6 m."""
 MAX_OFFSET_M = 50.0
-"""Largest offset of a tag from the lane's line. [m] Source: chosen by hand, wider than any carriageway."""
+"""Largest offset of a tag from the lane's line. [m] Wider than any carriageway."""
 
 
 @dataclass(frozen=True, slots=True)

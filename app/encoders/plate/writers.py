@@ -276,7 +276,7 @@ def _points(points: np.ndarray[tuple[int, ...], np.dtype[np.float64]], sheet_hei
 
 _INK_NAMES = {Layer.BLEED: str(Layer.BASE), Layer.CROP: "All"}
 """Bleed is printed with the base's ink; crop marks are in the registration colour, that is on every separation."""
-_MIN_REPEATS = 3  # a text that occurs as often is written once, as a form; chosen by hand
+_MIN_REPEATS = 3  # a text that occurs as often is written once, as a form
 
 
 def write_pdf(drawings: Drawing | Sequence[Drawing], *, compress: bool = True) -> bytes:

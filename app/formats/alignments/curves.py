@@ -17,21 +17,21 @@ from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_VERTICES, Floats
 Ints = npt.NDArray[np.int64]
 
 MAX_STEP_M = 2.0
-"""Greatest distance between vertices along the reference line. [m] Source: chosen by hand; values that the file gives
-as polynomials, such as widths, are linear between vertices."""
+"""Greatest distance between vertices along the reference line. [m] Values that the file gives as polynomials, such as
+widths, are linear between vertices."""
 GAP_WARNING_M, GAP_ERROR_M = 0.01, 0.10
-"""Distance between the end of an element and the start of the next one. [m] Source: chosen by hand: the accuracy of a
-good survey, and the accuracy at which a marker still lies in its lane."""
+"""Distance between the end of an element and the start of the next one. [m] The accuracy of a good survey, and the
+accuracy at which a marker still lies in its lane."""
 MAX_SPIRAL_TURN_RAD = 4.0 * np.pi
-"""A clothoid turns by less. [rad] Source: chosen by hand; the quadrature is exact to 1e-12 of its length."""
+"""A clothoid turns by less. [rad] The quadrature is exact to 1e-12 of its length."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _NODES, _WEIGHTS = (_NODES + 1.0) / 2.0, _WEIGHTS / 2.0  # on 0 to 1
 _CELL_NODES, _CELL_WEIGHTS = np.polynomial.legendre.leggauss(5)
 _CELL_NODES, _CELL_WEIGHTS = (_CELL_NODES + 1.0) / 2.0, _CELL_WEIGHTS / 2.0
 _CELLS = 32
-"""Cells of the table of arc lengths of a cubic. Source: by hand; a cubic of 100 m is off by less than 1 um along it."""
+"""Cells of the table of arc lengths of a cubic. A cubic of 100 m is off by less than 1 um along it."""
 _NEWTON = 6
-"""Steps to the end of a cubic across its chord. Source: by hand; each doubles the digits that are right."""
+"""Steps to the end of a cubic across its chord. Each doubles the digits that are right."""
 _PROBES = np.linspace(0.0, 1.0, 5)
 """Where the curvature of a step is looked at."""
 

@@ -38,7 +38,7 @@ from app.formats.surveys.dxf_reader import open_dxf, reading_dxf
 Floats = npt.NDArray[np.float64]
 
 NAME_DISTANCE_M = 10.0
-"""Farthest distance of a text from the line that it names. [m] Source: chosen by hand, three lane widths."""
+"""Farthest distance of a text from the line that it names. [m] Three lane widths."""
 _SIDE = re.compile(r"(?P<lane>.*?)[ _.:-]*(?P<side>left|right|_l|_r|-l|-r)", re.IGNORECASE)
 _LINES = "LINE ARC CIRCLE LWPOLYLINE POLYLINE"
 _FLAT = 1e-6  # [unit] rise of an arc above its chord below which it is a line; source: far below a survey's accuracy

@@ -38,7 +38,7 @@ SPEEDS_KMH = (2.0, 250.0)
 """Lowest and highest plausible speed limit. [km/h] Source: `app.planning.rules.SpeedKmh`."""
 KMH_PER_MPH = 1.609344
 """International mile. Source: NIST SP 811, table 6."""
-_MAX_FEATURES = 200_000  # source: chosen by hand, bounds the time of a file
+_MAX_FEATURES = 200_000  # bounds the time of a file
 _SINGULAR = {"joint": "joints", "manhole": "manholes", "crossing": "crossings", "bridge": "bridges"}
 _SPEED = re.compile(r"\s*(?P<value>[0-9]+(\.[0-9]+)?)\s*(?P<unit>mph|km/?h|kph)?\s*", re.IGNORECASE)
 _SPEED_NAMES = ("speed_limit_kmh", "speed_limit_mph", "maxspeed")
@@ -251,7 +251,7 @@ def _bad_vertex(where: str, what: str) -> InvalidParameter:
 
 
 JOIN_M = 0.02
-"""Ends that are this near meet. [m] Source: chosen by hand, twice the last digit of 1e-7 degrees."""
+"""Ends that are this near meet. [m] Twice the last digit of 1e-7 degrees."""
 _EARTH_M = 6_371_000.0  # [m] mean radius; source: IUGG
 
 
@@ -369,11 +369,11 @@ _SIDES = {
     "centre": "centre",
     "center": "centre",
 }
-_AREA_HALF_WIDTH_M = 0.005  # [m] of a line that is an area to avoid, such as a joint; source: chosen by hand
+_AREA_HALF_WIDTH_M = 0.005  # [m] of a line that is an area to avoid, such as a joint
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 _BACKWARDS = ("-1", "reverse", "backward")
 _TWO_WAY = ("no", "false", "0")
-_MAX_WARNINGS = 50  # source: chosen by hand, what people read
+_MAX_WARNINGS = 50  # what people read
 
 
 @dataclass(frozen=True, slots=True)

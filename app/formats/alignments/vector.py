@@ -15,7 +15,7 @@ from app.formats.alignments.geometry import AlignmentFile
 from app.formats.surveys.gis_reader import list_gpkg_layers, name_crs, plain_values, repack_shapefile
 from app.formats.surveys.table import MAX_COLUMNS
 
-_MAX_LAYERS = 50  # source: chosen by hand, bounds the time of a file
+_MAX_LAYERS = 50  # bounds the time of a file
 _SHAPES = {1: Shape.LINE, 2: Shape.LINE, 0: Shape.POINT, 3: Shape.AREA, 4: Shape.POINT, 5: Shape.LINE, 6: Shape.AREA}
 """By GEOS' number of the geometry's type."""
 

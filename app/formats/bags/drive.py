@@ -95,7 +95,7 @@ _SPEEDS: dict[str, Callable[[Any], float]] = {
 }
 """Speed along the vehicle's x axis by type. [m/s]"""
 _APART = 3.0
-"""A sensor has no value where its nearest ones are farther apart, in median intervals. Source: chosen by hand."""
+"""A sensor has no value where its nearest ones are farther apart, in median intervals."""
 
 
 class BagFields(NamedTuple):
@@ -185,7 +185,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 FIXES = types_of("sensor_msgs", "NavSatFix")
 MAX_FIXES = 200_000
-"""[positions] chosen by hand, as `PoseLimits`."""
+"""[positions] as `PoseLimits`."""
 _KINDS = {VideoKind(kind): kind for kind in BagKind}
 _NS = 1e-9
 

@@ -18,10 +18,10 @@ from app.formats.format import SpooledFile
 
 FIELD = "file"
 MAX_CHUNK_BYTES = 256 * 1024**2
-"""[byte] of a chunk once it is expanded. Source: chosen by hand; recorders write 0.8 to 8 MB."""
+"""[byte] of a chunk once it is expanded. Recorders write 0.8 to 8 MB."""
 MAX_EXPANSION = 20
-"""[1] by which the chunks of a bag expand together, beyond `MAX_CHUNK_BYTES`. Source: by hand; recordings expand 1 to 5
-times, and each expanded byte is read two or three times."""
+"""[1] by which the chunks of a bag expand together, beyond `MAX_CHUNK_BYTES`. Recordings expand 1 to 5 times, and each
+expanded byte is read two or three times."""
 _CHUNK_HEAD, _RECORD_HEAD_BYTES = struct.Struct("<BQQQQ"), 9
 _SIZES = "compressed_size", "uncompressed_size"
 _MCAP_MAGIC = b"\x89MCAP0\r\n"

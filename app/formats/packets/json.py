@@ -33,7 +33,7 @@ from app.sensors.pose_track import ReceivedPacket
 Record = tuple[int, "dict[str, object] | BrokenEntry"]
 
 _LISTS = ("packets", "uplinks", "events", "records", "messages", "results")
-_MAX_DEPTH = 32  # levels of nesting; chosen by hand
+_MAX_DEPTH = 32  # levels of nesting
 _SPACE = " \t\r\n,\x1e\ufeff"
 
 
@@ -162,7 +162,7 @@ _DECODER = json.JSONDecoder(object_pairs_hook=_object_of)
 # api/proto/gw (v4); The Things Stack's "Data Formats" and "Storage Integration" pages (v3).
 
 
-_LEVELS = 5  # envelopes around an event; chosen by hand
+_LEVELS = 5  # envelopes around an event
 _ENVELOPES = ("payload", "result", "data", "message", "msg", "body", "event")
 _DURATION = re.compile(r"(\d{1,12}(?:\.\d{1,9})?)s\Z", re.ASCII)
 _OTHER_EVENTS = (
@@ -349,7 +349,7 @@ def _signal(value: object, missing: float) -> float:
 # === Packet logs as JSON: objects with named values, or uplink events of LoRaWAN network servers.
 
 
-_MAX_SHAPES = 100  # sets of names whose columns are remembered; chosen by hand
+_MAX_SHAPES = 100  # sets of names whose columns are remembered
 _Shapes = dict[tuple[str, ...], dict[str, int]]
 
 

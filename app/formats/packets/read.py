@@ -36,7 +36,7 @@ from app.sensors.pose_track import ReceivedPacket
 
 PacketReader = Callable[[PacketSource], Iterable[ReceivedPacket]]
 
-_LIKELY_SHARE = 0.9  # [1] of payloads with our version; of random bytes one in 16 has it; chosen by hand
+_LIKELY_SHARE = 0.9  # [1] of payloads with our version; of random bytes one in 16 has it
 _OTHER = {
     b"PK": "a ZIP archive: unpack it",
     b"\x1f\x8b": "compressed by gzip: unpack it",

@@ -378,7 +378,7 @@ _BYTE = re.compile(r"[0-9a-fA-F]{2}\Z")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d\Z")
 _CLOCK_TIME = re.compile(r"\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:?\d\d)?\Z", re.ASCII)
 _SEPARATORS = re.compile(r"[,;\s|]+")
-_MIN_BYTES = 8  # separate bytes in a row that are a payload, no date or address; chosen by hand
+_MIN_BYTES = 8  # separate bytes in a row that are a payload, no date or address
 
 
 def is_raw_payload(data: bytes) -> bool:

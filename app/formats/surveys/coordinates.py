@@ -40,7 +40,7 @@ from app.geodesy.systems import best_effort
 
 _ZONE_M = 1e6  # [m] one zone number; eastings with the number of the zone are this times the number greater
 _MAX_ZONE = 60
-_NARROW_ZONES = 9  # greatest number that eastings in feet without a zone could begin with; chosen by hand
+_NARROW_ZONES = 9  # greatest number that eastings in feet without a zone could begin with
 _HALF_WIDTH_M = 450_000.0  # greatest distance from the meridian of a zone of 6 degrees; 3 degrees are 334 km at 0 deg
 _FALSE_EASTING_M = 500_000.0  # of zones of transverse Mercator grids, EPSG guidance note 7-2, table of zoned grids
 
@@ -123,15 +123,15 @@ def without_zone(easting: Floats, system: CRS) -> tuple[Floats, int | None]:
 
 
 PAIRS = (("lon_deg", "lat_deg"), ("easting", "northing"))
-_SAMPLE = 1000  # cells of a column by which the form of its numbers is detected; chosen by hand
+_SAMPLE = 1000  # cells of a column by which the form of its numbers is detected
 _BLANKS = {" ": "blanks", "\u00a0": "no-break spaces", "\u2009": "thin spaces", "\u202f": "narrow no-break spaces"}
 _WKT = re.compile(r"\s*(?:SRID=[0-9]+;)?\s*(?:MULTI)?POINT\b.*|0[01][0-9A-Fa-f]{40,}", re.IGNORECASE | re.DOTALL)
 _SRID = re.compile(r"SRID=([0-9]{4,6});", re.IGNORECASE)
 _AGREE_M = 5.0
-"""Difference between two pairs of coordinates of a row that the datums of a continent explain. [m] Chosen by hand:
-above NAD83 - WGS 84 (1 to 2 m) and the rounding of five decimals of a degree, below NAD27 or ED50 (30 to 200 m)."""
+"""Difference between two pairs of coordinates of a row that the datums of a continent explain. [m] Above NAD83 - WGS 84
+(1 to 2 m) and the rounding of five decimals of a degree, below NAD27 or ED50 (30 to 200 m)."""
 _IGNORED = (Change("ignore_heights", True),)
-_FEW = 4  # rows whose heights may be equal by chance; chosen by hand
+_FEW = 4  # rows whose heights may be equal by chance
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
 

@@ -36,9 +36,9 @@ from app.geodesy.systems import best_effort, covers
 
 
 _NUMERIC = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*")
-_MAX_NUMBER = 40  # [character] longest cell that is a number; a float64 needs 24. Chosen by hand
+_MAX_NUMBER = 40  # [character] longest cell that is a number; a float64 needs 24
 _UNIT = re.compile(r"\s*[\[(]?(?:m|metres?|meters?|ft|us-?ft|usft|sft|feet|deg|degrees|°)[\])]?\s*", re.IGNORECASE)
-_MIN_SHARE = 0.9  # [1] of the first rows that must be numbers, or lie in the area of use; chosen by hand
+_MIN_SHARE = 0.9  # [1] of the first rows that must be numbers, or lie in the area of use
 _MIN_ROWS = 2  # columns cannot be identified by the position of one row alone
 _COORDINATES = ("lon_deg", "lat_deg", "easting", "northing")
 
@@ -246,8 +246,8 @@ _DELIMITERS = (";", "\t", "|", ",")
 _DELIMITER_NAMES = {"\t": "tab", SPACES: "blanks"}
 _COMMENTS = ("#", "//")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|//)", re.MULTILINE)
-_SAMPLE_LINES = 50  # lines by which the delimiter and the header are detected; chosen by hand
-_BATCH = 10_000  # rows at a time; chosen by hand
+_SAMPLE_LINES = 50  # lines by which the delimiter and the header are detected
+_BATCH = 10_000  # rows at a time
 _DECIMAL_COMMAS = re.compile(r"(?:\S+[ \t]+)?[+-]?[0-9]+,[0-9]+[ \t]+[+-]?[0-9]+,[0-9]+(?:[ \t].*)?\s*")
 
 

@@ -30,7 +30,7 @@ COORDINATE_ROLES = ("lon_deg", "lat_deg", "easting", "northing", "height")
 ROLES = (*COORDINATE_ROLES, *TEXT_ROLES, *NUMBER_ROLES)
 MATCHES = ("code", "nearest")
 MAX_AREA_DEG = 30.0
-"""Largest side of a declared area: a larger one would check nothing. [deg] Chosen by hand."""
+"""Largest side of a declared area: a larger one would check nothing. [deg]"""
 
 
 @dataclass(frozen=True, slots=True)

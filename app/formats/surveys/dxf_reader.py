@@ -26,7 +26,7 @@ _UNITS = {
 """Unit of length of each code of $INSUNITS, and how many of it one unit of the drawing is: inches, feet, mm, cm, m, km,
 dm, US survey feet. Source: Autodesk DXF reference, "HEADER section group codes"."""
 _UNITLESS = 0
-_HEAD_BYTES = 4096  # [byte] in which a binary file shows itself; chosen by hand
+_HEAD_BYTES = 4096  # [byte] in which a binary file shows itself
 
 
 def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceTable:

@@ -22,9 +22,9 @@ from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Faults, SourceTable
 _SQLITE = b"SQLite format 3\x00"
 _SHAPEFILE_CODE = 9994  # ESRI Shapefile Technical Description (1998), file header
 _PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg")
-_MAX_MEMBERS = 50  # files of an archive; chosen by hand
+_MAX_MEMBERS = 50  # files of an archive
 MAX_INFLATED = 512 * 1024**2
-"""Largest Shapefile, inflated. [byte] Chosen by hand."""
+"""Largest Shapefile, inflated. [byte]"""
 _PART = 100_000  # features read at a time, to bound memory
 
 

@@ -136,10 +136,10 @@ def _old_crs(document: dict[str, object]) -> str | None:
 
 SurveyReader = Callable[[bytes, ImportDeclaration], SourceTable]
 
-_HEAD_BYTES = 4096  # [byte] chosen by hand
+_HEAD_BYTES = 4096  # [byte]
 _DXF_STARTS = (b"0\n", b"0\r", b"999\n", b"999\r")
 _BELOW_TAB = frozenset(range(9))
-_DIRECTORY_BYTES = 1 << 17  # [byte] at the end of a ZIP, for its directory; 1000 files at 100 bytes. Chosen by hand
+_DIRECTORY_BYTES = 1 << 17  # [byte] at the end of a ZIP, for its directory; 1000 files at 100 bytes
 _GSI = re.compile(rb"(?:\*[0-9]{2}[0-9.]{4}[+-]\S{16}|[0-9]{2}[0-9.]{4}[+-]\S{8})(?:\s|$)")  # a first word
 
 

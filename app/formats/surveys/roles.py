@@ -42,10 +42,10 @@ _ELLIPSOIDAL = ("ellipsoidalheight", "ellipsoidheight", "ellheight", "ellipsheig
 WKT_NAMES = ("wkt", "wktgeom", "geom", "geometry", "thegeom", "geomwkt")
 _UNIT = re.compile(r"_(?:m|metres?|meters?|u?s?_?s?ft|ft_?us|ft_?intl|i?ft|feet|deg|degrees|dd|gon)$")
 _IN_BRACKETS = re.compile(r"\s*[\[(][^\])]*[\])]\s*$")  # a unit or a datum behind the name
-_MAX_NAME = 100  # [character] of a name that are looked at; chosen by hand
-_SAMPLE = 2000  # values by which a column is recognised; chosen by hand
-_MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows. Chosen by hand
-_MAX_SHOWN = 20  # names in a report; chosen by hand
+_MAX_NAME = 100  # [character] of a name that are looked at
+_SAMPLE = 2000  # values by which a column is recognised
+_MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows
+_MAX_SHOWN = 20  # names in a report
 _SIDES = ("left", "right", "unknown")
 
 

@@ -18,10 +18,10 @@ Flags = npt.NDArray[np.bool_]
 MAX_ROWS = 1_000_000
 MAX_COLUMNS = 256
 MAX_TEXT = 500
-"""Largest survey that is read in one file, and the longest text of a cell. [character] Chosen by hand."""
+"""Largest survey that is read in one file, and the longest text of a cell. [character]"""
 KEPT_FAULTS = 1000
-"""Faults of one kind that are kept with their texts; all are counted and flagged. Chosen by hand."""
-_PART = 10_000  # texts that are joined into one string; chosen by hand
+"""Faults of one kind that are kept with their texts; all are counted and flagged."""
+_PART = 10_000  # texts that are joined into one string
 
 
 class Severity(StrEnum):
@@ -240,7 +240,7 @@ class SurveyTable:
 
 
 _PLAIN = re.compile(r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?[ \t]*")
-_PART_CELLS = 10_000  # cells read in one step; chosen by hand
+_PART_CELLS = 10_000  # cells read in one step
 _NOT_NUMERIC = re.compile(r"[^0-9+\-.eE \x00]")
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+\s*")
 _GROUPED = re.compile(r"\s*[+-]?[0-9]{1,3}(?:[,' \u00a0\u2009][0-9]{3})+(?:\.[0-9]*)?\s*")
@@ -257,7 +257,7 @@ _IN_GROUPS = re.compile(
 _WITH_COMMA = re.compile(r"[+-]?([0-9]+),([0-9]+)")
 _WITH_POINT = re.compile(r"[+-]?[0-9]+\.[0-9]+")
 _MAX_SHOWN = 60  # [character] of a cell that is no plain number; none that is one in another form is longer
-_MIN_SHARE = 0.5  # [1] of the numbers above 999 that must be in groups; chosen by hand
+_MIN_SHARE = 0.5  # [1] of the numbers above 999 that must be in groups
 _WHOLE_DEGREES = re.compile(
     r"\s*([NSEW])?\s*([+-]?[0-9]{1,3})\s*[°d]\s*([0-9]{1,2}(?:[.,][0-9]*)?)\s*['′’m]\s*"
     r"(?:([0-9]{1,2}(?:[.,][0-9]*)?)\s*(?:\"|″|”|''|s))?\s*([NSEW])?\s*"

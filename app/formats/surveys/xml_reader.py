@@ -17,7 +17,7 @@ from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, Fa
 from app.formats.xml_tree import MAX_BYTES, check_xml, local_name
 
 MAX_ELEMENTS = 20 * MAX_ROWS
-"""Elements of a document. Chosen by hand."""
+"""Elements of a document."""
 _GPX_NAMES = {"name": "point", "desc": "description", "cmt": "comment", "sym": "symbol", "type": "type"}
 _KMZ_LIMITS = ArchiveLimits(members=1000, member_bytes=MAX_BYTES, total_bytes=MAX_BYTES, ratio=200.0)
 """Of a KMZ with its pictures. Ratio: KML of many points is about 20 times smaller in a ZIP; measured with 8 to 100,000

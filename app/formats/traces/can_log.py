@@ -321,16 +321,16 @@ def _valid(
 # by.
 
 
-_RATE_HZ = 100.0  # [Hz] of the spectrogram's signal; source: by hand, a wheel's second harmonic is slower
-_WINDOW, _PADDED = 128, 512  # samples of a window and of its transform; source: by hand, 1.3 s, bins of 0.2 Hz
-_FRAMES = 1200  # windows at most; source: by hand, bounds the time
-_COARSE_S, _FINE_S = 0.2, 0.02  # [s] steps of the offset; source: by hand, below the length of a window
+_RATE_HZ = 100.0  # [Hz] of the spectrogram's signal; a wheel's second harmonic is slower
+_WINDOW, _PADDED = 128, 512  # samples of a window and of its transform; 1.3 s, bins of 0.2 Hz
+_FRAMES = 1200  # windows at most; bounds the time
+_COARSE_S, _FINE_S = 0.2, 0.02  # [s] steps of the offset; below the length of a window
 _CIRCUMFERENCE_M = np.linspace(1.5, 2.6, 56)  # [m] trial lengths of a turn; source: tyres from small cars to vans
-_MIN_SPEED_M_S = 2.0  # [m/s] slower windows are left out; source: by hand, the lines are below 1 Hz there
-_MIN_DEVIATIONS = 6.0  # by which the best offset must exceed the mean of the others; source: by hand
-_MIN_LEAD = 1.15  # of the best offset over the next one; source: by hand
-_APART_S = 1.5  # [s] offsets further apart than this are others; source: by hand, longer than a window
-_MAX_WORK = 3e8  # offsets times windows times circumferences; source: by hand, bounds the time
+_MIN_SPEED_M_S = 2.0  # [m/s] slower windows are left out; the lines are below 1 Hz there
+_MIN_DEVIATIONS = 6.0  # by which the best offset must exceed the mean of the others
+_MIN_LEAD = 1.15  # of the best offset over the next one
+_APART_S = 1.5  # [s] offsets further apart than this are others; longer than a window
+_MAX_WORK = 3e8  # offsets times windows times circumferences; bounds the time
 
 
 def align_speed(

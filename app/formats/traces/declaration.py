@@ -256,7 +256,7 @@ def _check_range(name: str, value: float | None, low: float, high: float) -> Non
 
 
 MAX_LISTED = 200
-"""Gaps and notes beyond this are only counted. Source: chosen by hand, bounds the answer."""
+"""Gaps and notes beyond this are only counted. Bounds the answer."""
 
 
 @dataclass(frozen=True, slots=True)

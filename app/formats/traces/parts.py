@@ -27,10 +27,10 @@ from app.formats.traces.declaration import (
 )
 
 BLOCK_BYTES = 4 * 1024**2
-"""Bytes that are read at a time. Source: chosen by hand, bounds the memory."""
-_HEAD = 65536  # [byte] by which formats are detected; source: by hand
-_MAX_MEMBERS = 32  # files of an archive; source: by hand, a recorder writes three
-_MAX_RATIO = 400  # expanded over compressed size; source: by hand, deflate reaches 1032 with zeros only
+"""Bytes that are read at a time. Bounds the memory."""
+_HEAD = 65536  # [byte] by which formats are detected
+_MAX_MEMBERS = 32  # files of an archive; a recorder writes three
+_MAX_RATIO = 400  # expanded over compressed size; deflate reaches 1032 with zeros only
 _DEFECTS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, ValueError, RuntimeError)
 
 
@@ -166,12 +166,12 @@ def _printable(name: str) -> str:
 Floats = npt.NDArray[np.float64]
 
 MAX_SPEED_M_S = 100.0
-"""Largest plausible speed of a vehicle. [m/s] Source: chosen by hand, 360 km/h."""
+"""Largest plausible speed of a vehicle. [m/s] 360 km/h."""
 NEAR_S = 1.0
-"""A sample has a speed or a heading if a value is so near. [s] Source: chosen by hand, as
+"""A sample has a speed or a heading if a value is so near. [s] As
 `app.decoders.magnet.preprocess.MAX_INTERPOLATION_S`."""
-_GAP_INTERVALS, _GAP_S = 5.0, 0.02  # a gap is longer than both: in median intervals, [s]; source: by hand
-_MAX_RATE_HZ = 20_000.0  # [Hz] largest plausible rate of a bar; source: by hand, METRO's has 350
+_GAP_INTERVALS, _GAP_S = 5.0, 0.02  # a gap is longer than both: in median intervals, [s]
+_MAX_RATE_HZ = 20_000.0  # [Hz] largest plausible rate of a bar; METRO's has 350
 
 
 @dataclass(frozen=True, slots=True, eq=False)

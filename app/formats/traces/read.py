@@ -42,9 +42,9 @@ Field = npt.NDArray[np.float32]
 EARTH_UT = (15.0, 75.0)
 """Plausible magnitudes of the field at calibrated sensors. [uT] Source: the earth's field at the surface is 22 to 67 uT
 (World Magnetic Model); margin for the iron of a car by hand."""
-_RAW_UT = (8.0, 2000.0)  # [uT] plausible median magnitudes at raw sensors; source: by hand, offsets of hundreds of uT
-_AGREE = 0.2  # share by which the means of calibrated sensors differ at most; source: by hand
-_CHECKED = 20_000  # samples by which the unit is checked; source: by hand, speed only
+_RAW_UT = (8.0, 2000.0)  # [uT] plausible median magnitudes at raw sensors; offsets of hundreds of uT
+_AGREE = 0.2  # share by which the means of calibrated sensors differ at most
+_CHECKED = 20_000  # samples by which the unit is checked; speed only
 _BLOCK = 1 << 16  # samples that are converted at a time; bounds the memory
 _VEHICLE_FROM = {AxisConvention.ISO8855: (1, 1, 1), AxisConvention.FLU: (1, 1, 1), AxisConvention.FRD: (1, -1, -1)}
 
@@ -145,7 +145,7 @@ def _warn_dead_sensors(field: Field, part: str, report: TraceReport) -> None:
 
 Floats = npt.NDArray[np.float64]
 
-_EPOCH_S = 1e6  # [s] a first time above this counts from some epoch, so the trace starts at 0; source: by hand, 11 days
+_EPOCH_S = 1e6  # [s] a first time above this counts from some epoch, so the trace starts at 0; 11 days
 _MISSING_SPEED_CURE = "send the recorder's RawSpeed file, a CAN log or a speed column, or declare a constant speed"
 _SPEED_ALIASES = {"kph": "km/h", "kmh": "km/h", "kmph": "km/h", "mps": "m/s", "mi/h": "mph", "knots": "kn", "kt": "kn"}
 

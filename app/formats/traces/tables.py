@@ -35,8 +35,8 @@ from app.formats.traces.parts import Part
 
 Floats = npt.NDArray[np.float64]
 
-_MAX_COLUMNS = 4096  # chosen by hand
-_MAX_LINE_WITHOUT_END = 4096  # [character] a longer beginning without a line end is no header; chosen by hand
+_MAX_COLUMNS = 4096
+_MAX_LINE_WITHOUT_END = 4096  # [character] a longer beginning without a line end is no header
 
 
 def read_header(part: Part, delimiter: str) -> list[str]:

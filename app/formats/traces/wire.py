@@ -19,14 +19,14 @@ from app.sensors.magnetometer_bar import MAX_FIELD_UT
 Words = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-_NEAR_UT = 100.0  # [uT] change of half of the fields, at most; source: by hand, the earth's field turned round
-_RATES_HZ = (80.0, 1000.0)  # [Hz] median rates of a stream; source: by hand around the 350 Hz of METRO section 6.1
-_INTERVALS_US = (200.0, 200_000.0)  # [us] plausible intervals; source: by hand, 5000 to 5 Hz
-_MAX_BAD_WORDS = 4  # implausible fields of a sample that is kept; source: by hand, one sensor and a word
-_ANCHOR_SAMPLES, _MIN_SAMPLES = 48, 8  # samples in a row that show where samples begin; source: by hand
-_ANCHOR_WINDOWS = 400  # windows that are searched for them; source: by hand, bounds the time for other files
+_NEAR_UT = 100.0  # [uT] change of half of the fields, at most; the earth's field turned round
+_RATES_HZ = (80.0, 1000.0)  # [Hz] median rates of a stream; around the 350 Hz of METRO section 6.1
+_INTERVALS_US = (200.0, 200_000.0)  # [us] plausible intervals; 5000 to 5 Hz
+_MAX_BAD_WORDS = 4  # implausible fields of a sample that is kept; one sensor and a word
+_ANCHOR_SAMPLES, _MIN_SAMPLES = 48, 8  # samples in a row that show where samples begin
+_ANCHOR_WINDOWS = 400  # windows that are searched for them; bounds the time for other files
 _BLOCK = 4096  # samples that are taken at a time; speed only
-_SEARCH_BYTES, _SEARCH_LIMIT = 1 << 16, 1 << 24  # [byte] a step, and the length, of a search; source: by hand
+_SEARCH_BYTES, _SEARCH_LIMIT = 1 << 16, 1 << 24  # [byte] a step, and the length, of a search
 _BAD, _GOOD, _ODD_INTERVAL = 0, 1, 2
 
 

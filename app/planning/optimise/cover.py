@@ -45,8 +45,8 @@ _SECTION_WINDOWS = 8.0
 """Length of the sections that a long line is solved in, in windows; the first half of each is kept. Source: chosen by
 measurement: 3 km in windows of 100 m with 30 candidates each take 4 s in sections and cost 1.2 % more than the proved
 optimum, which takes 13 s; 10 km at once do not end."""
-_NODES = 5000  # nodes of branch and bound of one section, so that the same input gives the same result; source: by hand
-_GAP = 1e-6  # relative, below the price of one marker in a thousand; source: by hand
+_NODES = 5000  # nodes of branch and bound of one section, so that the same input gives the same result
+_GAP = 1e-6  # relative, below the price of one marker in a thousand
 _MAX_WINDOWS = 60.0
 """Length of a line in windows up to which sections are solved; longer ones are covered greedily, so that the time grows
 with the length alone. Source: chosen by measurement: sections take about 0.15 s a window."""
@@ -303,10 +303,10 @@ def _program(
 
 
 _ROUNDS = 60  # of adapting the limits; source: chosen by measurement, the count no longer falls after 25 to 35
-_REPAIRS = 3  # times that gaps with too much error are halved in each round; source: by hand
-_FIRST_SHARE = 0.3  # of the error, limit of a curve by itself; source: by hand, below what the spline adds to it
-_STRONGER, _WEAKER = 0.5, 1.1  # factors on the limits of gaps with too much and with little error; source: by hand
-_LITTLE = 0.6  # share of the error below which a gap may become longer; source: by hand
+_REPAIRS = 3  # times that gaps with too much error are halved in each round
+_FIRST_SHARE = 0.3  # of the error, limit of a curve by itself; below what the spline adds to it
+_STRONGER, _WEAKER = 0.5, 1.1  # factors on the limits of gaps with too much and with little error
+_LITTLE = 0.6  # share of the error below which a gap may become longer
 
 
 def fewest_pairs(

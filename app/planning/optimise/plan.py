@@ -77,13 +77,13 @@ FixModel = Callable[[Lane, Floats], tuple[Floats, Floats]]
 """Probability that a pass fixes the position at markers at chainages of a lane, and the standard error of the fix [m];
 both of the shape of the chainages."""
 
-_CANDIDATES_PER_WINDOW = 20  # where one marker is enough; source: by hand, a marker is at most 5 % early
+_CANDIDATES_PER_WINDOW = 20  # where one marker is enough; a marker is at most 5 % early
 _COUPLED_PER_WINDOW = 10  # where misses add up; source: as `cover._SECTION_WINDOWS`
-_FINEST_M = 1.0  # [m] between candidates; source: by hand, as the samples of lanes
-_NEAREST_FIXES_M = 5.0  # [m] of `fix_every_m` that a budget may buy; source: by hand, the least spacing of plates
+_FINEST_M = 1.0  # [m] between candidates; as the samples of lanes
+_NEAREST_FIXES_M = 5.0  # [m] of `fix_every_m` that a budget may buy; the least spacing of plates
 _BISECTIONS = 12  # source: 5 m to 5,000 m in steps of 0.2 %
-_FACTORS = (1.0, 0.5, 0.71, 1.41, 2.0)  # on the requirement, in the table; source: by hand
-_ALMOST_SURE = 1 - 1e-9  # highest probability of a fix that counts; source: by hand, for a finite logarithm
+_FACTORS = (1.0, 0.5, 0.71, 1.41, 2.0)  # on the requirement, in the table
+_ALMOST_SURE = 1 - 1e-9  # highest probability of a fix that counts; for a finite logarithm
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ _LINE_TAGS, _INFORMATION_TAG, _RFID, _MAGNET = (
     "rugged RFID tag",
     "magnet with shell",
 )  # items of app/planning/data/costs.csv
-_CONTINUED = 3.0  # longest gap in a line of magnets, in spacings; source: chosen by hand, two magnets left out
+_CONTINUED = 3.0  # longest gap in a line of magnets, in spacings; two magnets left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,9 +241,9 @@ def _range(low: float, high: float) -> str:
 
 
 _MAX_LEFT_OUT = 200
-"""Places left out that the report lists. Source: chosen by hand; plan.json has all of them."""
+"""Places left out that the report lists; `plan.json` has all of them."""
 
-_ZERO = 1e-9  # what is shown as 0; source: chosen by hand, rounding of sums of metres
+_ZERO = 1e-9  # what is shown as 0; rounding of sums of metres
 _COUNTED = {"plate": "plates", "magnet": "magnets", "tag": "information tags", "cerpm": "CERPMs"}
 
 
@@ -338,7 +338,7 @@ def _cell(text: str) -> str:
 
 
 SECTION_M = 1000.0
-"""Length of a section where no daily rate is given. [m] Source: chosen by hand, from one kilometre post to the next."""
+"""Length of a section where no daily rate is given. [m] From one kilometre post to the next."""
 SCHEDULE_COLUMNS = (
     "order", "day", "lane", "from_station", "to_station", "from_chainage_m", "to_chainage_m", "first_marker",
     "last_marker", "markers", "plates", "line_magnets", "information_tags", "holes", "cerpms",

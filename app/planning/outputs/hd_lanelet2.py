@@ -26,10 +26,9 @@ PIECE_M = 40.0
 """Length of a lanelet along the road's reference line; 50 m at most in bends too. [m] Source: TIER IV's convention of 1
 to 50 m."""
 CHORD_ERROR_M = 0.005
-"""Greatest distance of a boundary from its chords. [m] Source: chosen by hand, half of a survey's centimetre."""
+"""Greatest distance of a boundary from its chords. [m] Half of a survey's centimetre."""
 SAME_POINT_M = 0.02
-"""Ends of lanelets nearer than this are one node. [m] Source: chosen by hand, above the readers' rounding, below a
-line's width."""
+"""Ends of lanelets nearer than this are one node. [m] Above the readers' rounding, below a line's width."""
 _LONGEST_M, _SHORTEST_M = 50.0, 1.0  # [m] of a lanelet; source: TIER IV's convention
 _LINE_TAGS = {
     BoundaryStyle.SOLID: {"type": "line_thin", "subtype": "solid"},

@@ -20,8 +20,8 @@ from app.planning.outputs.hd_map import HdMap, MapMarker, attribute, number, ref
 
 
 CURVE_ERROR_M = 0.002
-"""Greatest distance of the curves from the lane's samples, and of heights and widths from theirs. [m] Source: chosen by
-hand, a fifth of the centimetre that maps may be off."""
+"""Greatest distance of the curves from the lane's samples, and of heights and widths from theirs. [m] A fifth of the
+centimetre that maps may be off."""
 _TILT_ERROR_RAD = 0.0002  # [rad] of superelevation; source: 2 mm at 10 m beside the line
 _ROUNDS = 12  # of Newton's method; source: converges to a nanometre in 5 from a sample half a metre away
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
@@ -181,9 +181,9 @@ def _hermite_error(at: Floats, values: Floats, slopes: Floats, breaks: npt.NDArr
 
 
 MAX_BESIDE_M = 100.0
-"""Greatest distance of a marker from the nearest lane. [m] Source: chosen by hand, wider than a motorway."""
+"""Greatest distance of a marker from the nearest lane. [m] Wider than a motorway."""
 _MISPLACED_M = 0.01  # [m] between a marker and its place by s and t; source: the error that maps may have
-_SAME_END_M = 0.05  # [m] between the end of a lane and the start of its successor; source: chosen by hand
+_SAME_END_M = 0.05  # [m] between the end of a lane and the start of its successor
 _MARKS = {
     BoundaryStyle.SOLID: "solid",
     BoundaryStyle.DASHED: "broken",

@@ -167,8 +167,8 @@ def _trade_off_files(optimum: Optimum, currency: str, options: OutputOptions) ->
 PACKAGE_FORMAT = "waymark-package/1"
 MANIFEST = "manifest.json"
 PLATES_A_PART, SHEETS_A_PART, QUALITY_A_PART = 20, 20, 300
-"""Plates, drilling sheets and rows of a quality sheet that are written at a time. Source: chosen by hand, a second or
-two of work and some megabytes; a quality sheet of 101 pages."""
+"""Plates, drilling sheets and rows of a quality sheet that are written at a time. A second or two of work and some
+megabytes; a quality sheet of 101 pages."""
 MAX_SHEET_MAGNETS = 1000
 """Magnets of a line on one drilling sheet. Source: those of one marker, `app.families.magnet.layouts.MAX_MAGNETS`."""
 

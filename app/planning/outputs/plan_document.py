@@ -34,8 +34,8 @@ from app.radio.settings import RadioSettings
 
 PLAN_FORMAT = "waymark-plan/1"
 MAX_PLAN_BYTES = 500_000_000
-"""Longest document. [bytes] Source: chosen by hand, several times that of 500,000 markers."""
-_MAX_SAMPLES = 5_000_000  # of one array; source: chosen by hand, 5,000 km of lane
+"""Longest document. [bytes] Several times that of 500,000 markers."""
+_MAX_SAMPLES = 5_000_000  # of one array; 5,000 km of lane
 
 
 def _read_array(value: object) -> Floats:
@@ -227,7 +227,7 @@ def _unreadable(message: str, field: str, limit: str) -> UnreadableUpload:
 
 
 _DECIMALS = 9  # of degrees, 0.1 mm; source: as drilling sheets
-_LANE_TOLERANCE_M = 0.02  # [m] of a lane's line on the map; source: chosen by hand, below what a map shows
+_LANE_TOLERANCE_M = 0.02  # [m] of a lane's line on the map; below what a map shows
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
 

@@ -33,7 +33,7 @@ CODES = {"plate": "PLATE", "line": "MAGL", "tag": "MAGT", "cerpm": "CERPM"}
 """Feature codes of the points and layers of the DXF."""
 _ZONES = 60  # of UTM; source: DMA TM 8358.2
 _GEOD = Geod(ellps="WGS84")
-_AHEAD_M = 10.0  # [m] to the second point of a bearing; source: chosen by hand, 0.1 mm of it are 0.0006 degrees
+_AHEAD_M = 10.0  # [m] to the second point of a bearing; 0.1 mm of it are 0.0006 degrees
 _MAX_LON_SPAN_DEG = 6.0  # of a road in one zone; source: as for exports, a zone's width
 
 
@@ -228,7 +228,7 @@ def _default_system(plan: Plan) -> str:
 
 _INSUNITS = {"m": 6, "ft-intl": 2, "ft-us": 21}  # source: Autodesk DXF reference, "HEADER section group codes"
 _COLOURS = {"plate": 5, "line": 2, "tag": 1, "cerpm": 3}  # ACI of the layers: blue, yellow, red, green
-_TEXT_HEIGHT_M = 0.5  # of labels in CAD; source: chosen by hand, 1 mm at 1 : 500
+_TEXT_HEIGHT_M = 0.5  # of labels in CAD; 1 mm at 1 : 500
 _STAMP = "2000-01-01T00:00:00.000Z"  # of GeoPackages, so that the same plan gives the same bytes
 _DATES = re.compile(r"(\$TD(?:CREATE|UPDATE)\n 40\n)[^\n]*")
 _GUIDS = re.compile(r"(\$(?:FINGERPRINT|VERSION)GUID\n  2\n)[^\n]*")

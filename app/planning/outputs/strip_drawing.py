@@ -34,17 +34,17 @@ ROW_HEIGHT_MM = 78.0
 """Height of a row with its heading. [mm] Source: three rows above the title block of A3."""
 _LEFT_MM, _WIDTH_MM = 20.0, 390.0
 _MIDDLE_MM = _LEFT_MM + _WIDTH_MM / 2
-_TOLERANCE_MM = 0.03  # of lines on paper; source: chosen by hand, a third of the thinnest line
-_CELL_MM = 0.4  # of the grid of taken places; source: chosen by hand, a quarter of the smallest letters
-_SHARED_M = 0.3  # between edges of two lanes that are one painted line; source: chosen by hand, two widths of paint
-_FROM_MATCH_MM = 7.0  # between numbered stations and match lines; source: chosen by hand, half of a station's number
-_TICKS = 5  # from one numbered station to the next; source: chosen by hand
+_TOLERANCE_MM = 0.03  # of lines on paper; a third of the thinnest line
+_CELL_MM = 0.4  # of the grid of taken places; a quarter of the smallest letters
+_SHARED_M = 0.3  # between edges of two lanes that are one painted line; two widths of paint
+_FROM_MATCH_MM = 7.0  # between numbered stations and match lines; half of a station's number
+_TICKS = 5  # from one numbered station to the next
 _UNITS = {EventKind.SPEED_LIMIT: " km/h", EventKind.CURVE: " deg"}
-_LIFTS_MM = (3.0, 5.5, 10.0, 13.0)  # of numbers outside the road; source: chosen by hand, round the stations' numbers
-_BELOW_MM = 12.0  # of a row, for stations and labels below the road; source: chosen by hand
-_HEADING_MM = 7.0  # of a row; source: chosen by hand
-_NEAR_MM = 3.0  # between a strip's road and areas that it shows; source: chosen by hand
-_BEYOND_MM = 9.0  # of match lines beyond the road; source: chosen by hand
+_LIFTS_MM = (3.0, 5.5, 10.0, 13.0)  # of numbers outside the road; round the stations' numbers
+_BELOW_MM = 12.0  # of a row, for stations and labels below the road
+_HEADING_MM = 7.0  # of a row
+_NEAR_MM = 3.0  # between a strip's road and areas that it shows
+_BEYOND_MM = 9.0  # of match lines beyond the road
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,11 +24,11 @@ STRIP_MM = 360.0
 ROW_MM = 52.0
 """Greatest height of a strip's road on paper. [mm] Source: three strips on A3."""
 MAX_STRIPS = 3000
-"""Strips of one plan at most. Source: chosen by hand, a thousand sheets."""
+"""Strips of one plan at most. A thousand sheets."""
 _WANTED_SHEETS = {250: 12, 500: 40, 1000: 120, 2000: 240}
-"""A scale is taken up to this many sheets, else the next one. Source: chosen by hand, what a crew carries."""
-_SHORTEST = 0.02  # of the greatest length, which a strip has at least; source: chosen by hand
-_JUMP_M = 3.0  # between stations of neighbouring samples, which an equation makes; source: chosen by hand, three steps
+"""A scale is taken up to this many sheets, else the next one. What a crew carries."""
+_SHORTEST = 0.02  # of the greatest length, which a strip has at least
+_JUMP_M = 3.0  # between stations of neighbouring samples, which an equation makes; three steps
 _STRIPS_A_SHEET = 3
 _BESIDE_M = 30.0  # [m] from the reference lane, within which other lanes are in its strips; source: a carriageway
 

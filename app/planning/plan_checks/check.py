@@ -188,8 +188,7 @@ def _least_probability(
 
 
 CONFUSION_M = 20.0
-"""Distance within which equal codes of two markers are confused. [m] Source: chosen by hand, a receiver's position in a
-street of houses."""
+"""Distance within which equal codes of two markers are confused. [m] A receiver's position in a street of houses."""
 _ROOM_M = {"cerpm": 0.1, "magnet": MIN_GAP_M / 2}  # [m] half of the free distance round a marker; source: its size
 
 

@@ -68,8 +68,8 @@ def compare(
 
 
 _DEFAULT_REGION = Region.US915  # of the CERPM paper's markers
-_EU_SETTINGS = RadioSettings(frequency_hz=868_300_000, power_dbm=14.0)  # source: by hand, within band M
-_CARRIAGEWAY_M = 30.0  # [m] across; markers farther aside are farther along a bend; source: by hand, a motorway
+_EU_SETTINGS = RadioSettings(frequency_hz=868_300_000, power_dbm=14.0)  # within band M
+_CARRIAGEWAY_M = 30.0  # [m] across; markers farther aside are farther along a bend; a motorway
 
 
 def check_cerpms(plan: Plan) -> Iterator[PlanFinding]:
@@ -241,7 +241,7 @@ def _busiest(cerpms: Sequence[PlannedMarker], air: Air) -> tuple[RoadMarkers, Pl
 _SERVED = (
     0.95  # share of a kind of vehicle that must have a readable clearance; source: as app/planning/magnet_checks.py
 )
-_COUNTED = 2_000  # codes of a codebook that are counted; source: chosen by hand, bounds the time
+_COUNTED = 2_000  # codes of a codebook that are counted; bounds the time
 
 
 def check_magnets(plan: Plan) -> Iterator[PlanFinding]:
@@ -380,8 +380,8 @@ MAX_BLUR_UNITS = 1.0
 """Units that a plate may move during the exposure. Source: PolyU trials (docs/benchmarks.md): 80 km/h with 1/1000 s is
 0.6 units and read."""
 MAX_SHEAR_SHARE = 0.1
-"""Share of its length by which a rolling shutter may stretch a plate. Source: chosen by hand, the pose fit's slack."""
-_STEP_M = 0.02  # [m] between distances that are tried; source: chosen by hand
+"""Share of its length by which a rolling shutter may stretch a plate. The pose fit's slack."""
+_STEP_M = 0.02  # [m] between distances that are tried
 _NEAREST_M, _FARTHEST_M = 0.3, 40.0  # [m] source: beyond it no unit of 50 mm covers two rows of a camera up to 5 m high
 
 

@@ -46,12 +46,12 @@ WHITE_REFLECTANCE = 0.75
 TEXELS_PER_MM = 1.0
 """[1/mm] of the simulated face. Source: default of `plate_face`."""
 PASSES, FRAMES_PER_PASS = 3, 6
-"""Simulated passes, and frames rendered of each. Source: chosen by hand, for a second and a half of a processor."""
+"""Simulated passes, and frames rendered of each. For a second and a half of a processor."""
 MAX_SHIFT = math.log(30.0)
-"""[log height] greatest shift of the model. Source: chosen by hand: units of 26 px, which no pass shows."""
-_SHIFTS = np.linspace(0.0, MAX_SHIFT, 35)  # at which the likelihood is computed; source: chosen by hand
+"""[log height] greatest shift of the model. Units of 26 px, which no pass shows."""
+_SHIFTS = np.linspace(0.0, MAX_SHIFT, 35)  # at which the likelihood is computed
 _GRAIN = 0.03  # of the asphalt; source: middle of `_GRAIN` of app/planning/proof/plates.py
-_NEIGHBOURS_DEG = (-0.00036, -0.00018, 0.00018, 0.00036)  # [deg] 20 and 40 m; source: chosen by hand, a dense road
+_NEIGHBOURS_DEG = (-0.00036, -0.00018, 0.00018, 0.00036)  # [deg] 20 and 40 m; a dense road
 _NEAR_NUMBERS = (-2, -1, 1, 2)
 
 Floats = npt.NDArray[np.float64]
@@ -252,7 +252,7 @@ def _scenes(
 # === A picture of what a camera on a vehicle sees of a plate, and what the decoder reads in it.
 
 
-_SEED = 4  # draws light, sensor and noise, the same for every view; source: chosen by hand, a plain piece of road
+_SEED = 4  # draws light, sensor and noise, the same for every view; a plain piece of road
 
 
 def render_view(

@@ -174,10 +174,10 @@ MIN_UNIT_PX = 1.0
 """[px] height of a unit from which frames count. Source: `MIN_UNIT_PX` of app/planning/proof/plates.py."""
 STRETCH_M = 500.0
 """[m] of lane that path errors are predicted for. Source: `LANE_STRETCH_M` of app/planning/proof/prove.py."""
-_GRID_M = 0.02  # [m] between distances at which the view is computed; source: chosen by hand
-_PHASES = 8  # of the first frame; source: chosen by hand
-_SPEED_STEP_MPS = 0.5  # [m/s] speeds are rounded up to it; source: chosen by hand, at most 4 % of 13 m/s
-_OFFSET_STEP_M = 0.1  # [m] source: chosen by hand, less than a vehicle's own 0.15 m
+_GRID_M = 0.02  # [m] between distances at which the view is computed
+_PHASES = 8  # of the first frame
+_SPEED_STEP_MPS = 0.5  # [m/s] speeds are rounded up to it; at most 4 % of 13 m/s
+_OFFSET_STEP_M = 0.1  # [m] less than a vehicle's own 0.15 m
 
 
 def plate_rates(
@@ -323,7 +323,7 @@ def path_errors_m(lane: Lane, chainages_m: Floats, rules: PredictionRules) -> tu
 
 
 MAX_VIEW_PIXELS = 9_000_000
-"""Pixels of a picture at most. Source: chosen by hand: 3840 x 2160, two seconds of a processor."""
+"""Pixels of a picture at most. 3840 x 2160, two seconds of a processor."""
 
 
 class ViewReading(StrEnum):
@@ -369,7 +369,7 @@ def check_view_size(rules: CameraRules) -> None:
 
 
 MAX_FRAMES = 40
-"""Frames of a pass that are listed; of more, so many at equal steps. Source: chosen by hand, a page of a table."""
+"""Frames of a pass that are listed; of more, so many at equal steps. A page of a table."""
 _PASS_GRID_M = 0.02  # [m] between distances at which the view is computed; source: as in app/planning/predict/rates.py
 
 

@@ -47,7 +47,7 @@ PLACING_SD_M = 0.01
 _KEY = bytes(range(16))  # of the simulated agency; the proof needs authentic packets, not secret ones
 _STEP_M = 1.0  # [m] between points of a boundary; source: the alignment's own step
 _MAX_JITTER = 0.45  # source: `Radio` needs less than half
-_MIN_ACCURACY_M = 1e-3  # [m] of a survey, so that its weight is finite; source: by hand
+_MIN_ACCURACY_M = 1e-3  # [m] of a survey, so that its weight is finite
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,8 +206,8 @@ REACH_M = 0.4
 _OTHER = -1  # tag number of magnets that are not driven for
 _TAG_REACH_M = 1.0  # [m] of a tag's reading from its first magnet; source: app/demo/magnets.py
 _WEAVE_M = 0.1  # [m] source: app/demo/magnets.py, between the 0.05 m of the benchmarks and its 0.12 m
-_CURVED_1PM = 1e-5  # [1/m] below it a road is straight; source: by hand, 100 km of radius
-_SLOWER = 0.5  # of the speed, to find out whether speed is the cause; source: chosen by hand
+_CURVED_1PM = 1e-5  # [1/m] below it a road is straight; 100 km of radius
+_SLOWER = 0.5  # of the speed, to find out whether speed is the cause
 _HEADING_STD_DEG = 0.1  # [deg] of a tag's surveyed direction; source: TAG_BEARING_STD_DEG of the decoder
 
 

@@ -43,9 +43,9 @@ from app.simulation.plate_scene import Air, PlateScene, Shadow, face_truth
 
 _RAIN_HAZE = (0.05, 0.35)  # share of airlight; source: assumed, half of the haze of `draw_stress`
 _RAIN_GLARE = (0.0, 0.25)  # radiance of the mirrored sky; source: assumed, below the 0.35 of `draw_stress`
-_RAIN_BLUR_PX = (0.2, 0.8)  # [px] that drops on the windscreen add; source: assumed, no measurement kept
+_RAIN_BLUR_PX = (0.2, 0.8)  # [px] that drops on the windscreen add; assumed
 _RAIN_LIGHT = 0.5  # of a dry day's electrons; source: assumed, an overcast sky
-_RAIN_ROAD = 0.6  # reflectance of a wet road over that of a dry one; source: assumed, no measurement kept
+_RAIN_ROAD = 0.6  # reflectance of a wet road over that of a dry one; assumed
 
 
 def draw_drive(camera: CameraRules, parts: frozenset[Condition], rng: np.random.Generator) -> Conditions:
@@ -117,9 +117,9 @@ FAR_M = 18.0
 PLACEMENT_SD_M, ROTATION_SD_DEG = 0.15, 2.0
 """[m, deg] of the vehicle's offset and the plate's direction. Source: app/demo/drive.py and `Driver` of the CERPMs."""
 _GRAIN = (0.01, 0.05)  # of the asphalt; source: benchmarks/plates/sets.py
-_FEW_FRAMES = 2  # readable frames, below which a miss is due to the speed alone; source: chosen by hand
-_CAUSE_FRAMES = 6  # nearest frames in which a cause is looked for; source: chosen by hand, for speed
-_SLOWER = 0.25  # of the speed, to find out whether speed is the cause; source: chosen by hand
+_FEW_FRAMES = 2  # readable frames, below which a miss is due to the speed alone
+_CAUSE_FRAMES = 6  # nearest frames in which a cause is looked for; for speed
+_SLOWER = 0.25  # of the speed, to find out whether speed is the cause
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -101,9 +101,9 @@ def markers_beside(frame: LaneFrame, markers: Sequence[PlannedMarker], reach_m: 
 # along the road is taken from a random start. Over several drives the sample moves, so that weak markers are found.
 
 
-_SPEED_STEP_MPS = 5.0  # [m/s] of the strata; source: chosen by hand, 18 km/h
+_SPEED_STEP_MPS = 5.0  # [m/s] of the strata; 18 km/h
 _BEND_1PM = 1 / 400.0  # [1/m] source: the default of `road.curve_radius_m`
-_CREST_1PM = 1 / 1000.0  # [1/m] change of grade; source: chosen by hand, sharper than any crest at 60 km/h
+_CREST_1PM = 1 / 1000.0  # [1/m] change of grade; sharper than any crest at 60 km/h
 
 
 def stratum_of(marker: PlannedMarker, lane: Lane) -> tuple[int, bool, bool, str]:
@@ -150,18 +150,18 @@ def cut_stretches(length_m: float, longest_m: float) -> list[tuple[float, float]
 
 
 PLATES_A_UNIT, TAGS_A_UNIT = 4, 8
-"""Markers of a unit. Source: chosen by hand, some seconds of work."""
+"""Markers of a unit. Some seconds of work."""
 LINE_STRETCH_M, LANE_STRETCH_M = 60.0, 500.0
-"""[m] driven over a line's magnets, and past CERPMs. Source: chosen by hand, some seconds of work."""
+"""[m] driven over a line's magnets, and past CERPMs. Some seconds of work."""
 TAGS_NEAR_M = 500.0
-"""[m] within which tags are looked for. Source: chosen by hand, a road with one codebook."""
+"""[m] within which tags are looked for. A road with one codebook."""
 NEAR_M = 200.0
 """[m] within which plates are in the codebook of a frame. Source: ten times the 20 m of a coarse position."""
 MAX_UNITS = 10_000
-"""Units of one proof at most. Source: chosen by hand, some hours of work on two cores."""
-_MIN_MARKERS = 4  # in a stretch that is driven; source: chosen by hand, two pairs
-_BESIDE_M = 0.8  # [m] beyond a boundary, where its markers still are; source: twice `CerpmRules` and paint, by hand
-_LINE_OFFSET_SD_M = 0.25  # [m] of the bar's middle over a line; source: chosen by hand, a quarter of the bar
+"""Units of one proof at most. Some hours of work on two cores."""
+_MIN_MARKERS = 4  # in a stretch that is driven; two pairs
+_BESIDE_M = 0.8  # [m] beyond a boundary, where its markers still are; source: twice `CerpmRules` and paint
+_LINE_OFFSET_SD_M = 0.25  # [m] of the bar's middle over a line; a quarter of the bar
 _NO_PASS = MarkerPass(marker=0, weight=0.0, lost=True, readable=0, seen=0, read=0, fix_m=None, cause="lost")
 
 

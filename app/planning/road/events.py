@@ -18,8 +18,8 @@ from app.planning.rules import RoadRules
 Floats = npt.NDArray[np.float64]
 
 REACH_M = 15.0
-"""Farthest distance of an event from its lane. [m] Source: chosen by hand, signs stand beside four lanes."""
-_GAP_M = 10.0  # [m] parts of a bend that are nearer are one; source: chosen by hand, two seconds of steering at 20 km/h
+"""Farthest distance of an event from its lane. [m] Signs stand beside four lanes."""
+_GAP_M = 10.0  # [m] parts of a bend that are nearer are one; two seconds of steering at 20 km/h
 _EARTH_M = 6_371_000.0  # [m] mean radius; source: IUGG
 
 

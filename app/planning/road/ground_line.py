@@ -17,8 +17,7 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 MAX_LANES_M = 500_000.0
-"""Length of all lanes of a plan at most. [m] Source: chosen by hand; 100 km of four lanes fit, a road of 1,000 km does
-not."""
+"""Length of all lanes of a plan at most. [m] 100 km of four lanes fit, a road of 1,000 km does not."""
 PIECE_M = 50.0
 """Longest piece between vertices: at 60 degrees of latitude straight lines in degrees, in a projection and on the
 ellipsoid differ by less than 0.1 mm on it. [m] Source: L^2 tan(lat) / (8 R)."""
@@ -168,17 +167,13 @@ def steps_m(lon_deg: Floats, lat_deg: Floats) -> tuple[Floats, Floats]:
 _REACH_M = 7.0  # [m] over which a vertex between long pieces turns, to each side; source: half of 14 m, the longest
 # spacing of the Karlsruhe map's bends (issue 13)
 _NOISE_1PM = 4e-4  # [1/m] standard deviation of curvature that noise may cause; source: radii above 500 m at 5 sigma
-_SMOOTHING_M = (2.0, 8.0)  # [m] least and most standard deviation of the Gaussian; source: chosen by hand, a bend with
+_SMOOTHING_M = (2.0, 8.0)  # [m] least and most standard deviation of the Gaussian; a bend with
 # a radius of 6 m keeps 97 % of its curvature at the least, one of 60 m turning 30 degrees 95 % at the most
-_END_FIT = (
-    6.0  # widths of the Gaussian over which the ends are fitted; source: chosen by hand, noise as between the ends
-)
+_END_FIT = 6.0  # widths of the Gaussian over which the ends are fitted; noise as between the ends
 _BEND_NORM = 3 / (8 * math.sqrt(math.pi))  # integral of the squared second derivative of a Gaussian of width 1
 _THIRD_DIFFERENCE = math.sqrt(20.0)  # of white noise; root of 1 + 9 + 9 + 1
 _MAD = 0.6745  # median of the absolute value of a normal variable with standard deviation 1
-_GRADE_SMOOTHING_M = (
-    5.0  # [m] of heights before their slope is taken; source: chosen by hand, 1 cm noise at 1 m is 0.1 %
-)
+_GRADE_SMOOTHING_M = 5.0  # [m] of heights before their slope is taken; 1 cm noise at 1 m is 0.1 %
 
 
 def piece_directions_rad(line: GroundLine) -> Floats:

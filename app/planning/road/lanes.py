@@ -43,7 +43,7 @@ MIN_RADIUS_M = 4.39
 car P at its sharpest turn, 14.4 ft; no car's middle follows a smaller one."""
 MAX_TURN_DEG = 90.0
 """Largest turn at one vertex. [deg] Source: app/roads/axis.py, sharper ones are corners."""
-_BRIDGE_M = 3.0  # [m] of height between two crossing lanes; source: chosen by hand, below every bridge's clearance
+_BRIDGE_M = 3.0  # [m] of height between two crossing lanes; below every bridge's clearance
 _RADII = (  # speed [km/h] and smallest radius [m], superelevation 6 %; source: AASHTO Green Book 2018, table 3-7
     (30.0, 21.0), (40.0, 43.0), (50.0, 79.0), (60.0, 123.0), (70.0, 184.0), (80.0, 252.0), (90.0, 336.0),
     (100.0, 437.0), (110.0, 560.0), (120.0, 756.0), (130.0, 951.0),

@@ -22,7 +22,7 @@ from app.planning.alignment import AlignmentDeclaration
 Floats = npt.NDArray[np.float64]
 
 MAX_LOCAL_M = 200_000.0
-"""Farthest distance of local coordinates from their origin. [m] Source: chosen by hand; UTM northings are larger."""
+"""Farthest distance of local coordinates from their origin. [m] UTM northings are larger."""
 _CRS84 = "OGC:CRS84"
 _PROJ_KEYS = frozenset({
     "R", "a", "alpha", "axis", "b", "datum", "ellps", "f", "gamma", "k", "k_0", "lat_0", "lat_1", "lat_2", "lat_ts",

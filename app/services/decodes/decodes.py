@@ -190,7 +190,7 @@ _READING_WRITERS: Mapping[str, Callable[[DecodeRow], Any]] = {"geojson": reading
 
 
 MAX_PACKETS = 20_000
-"""Packets that are listed at most. Source: chosen by hand; 2 MB of JSON."""
+"""Packets that are listed at most. 2 MB of JSON."""
 
 
 class VehicleTrackDocument(TypedDict):

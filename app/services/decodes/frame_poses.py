@@ -37,9 +37,9 @@ from app.tracks.files import gpx_document
 
 
 EVERY_S = 5.0
-"""[s] between two positions that are kept. Source: by hand; positions of one minute share their error."""
+"""[s] between two positions that are kept. Positions of one minute share their error."""
 MAX_POSITIONS = 20_000
-"""Positions of a decode at most; of more, fewer are kept. Source: by hand, 27 hours."""
+"""Positions of a decode at most; of more, fewer are kept. 27 hours."""
 
 
 class ReceiverPositions(TypedDict):
@@ -74,22 +74,22 @@ def receiver_positions(track: PoseTrack | None) -> ReceiverPositions | None:
 
 
 RADIUS_SIGMAS, LEAST_RADIUS_M = 4.0, 5.0
-"""[1, m] radius round a pose that holds the vehicle with near certainty, over its standard deviation, and the least.
-Source: chosen by hand; 4 sigma holds 99.97 % of a normal distribution in two dimensions."""
+"""[1, m] radius round a pose that holds the vehicle with near certainty, over its standard deviation, and the least. 4
+sigma holds 99.97 % of a normal distribution in two dimensions."""
 UNKNOWN_RADIUS_M = 30.0
-"""[m] the same of a pose without an accuracy. Source: chosen by hand, a satellite receiver between buildings."""
+"""[m] the same of a pose without an accuracy. A satellite receiver between buildings."""
 MAX_BRIDGE_S = 3.0
-"""[s] between two positions of a track across which the vehicle's position is interpolated. Source: chosen by hand."""
+"""[s] between two positions of a track across which the vehicle's position is interpolated."""
 MAX_BEYOND_S = 0.5
-"""[s] before the first and after the last position of a track for which that position serves. Source: by hand."""
+"""[s] before the first and after the last position of a track for which that position serves."""
 MIN_SPEED_TIME_S, MAX_SPEED_TIME_S = 0.4, 3.0
-"""[s] over which a speed is taken from two positions. Source: chosen by hand: shorter ones are the receiver's noise."""
+"""[s] over which a speed is taken from two positions. Shorter ones are the receiver's noise."""
 MAX_SPEED_M_S = 90.0
-"""[m/s] of a vehicle, 324 km/h. Source: chosen by hand."""
+"""[m/s] of a vehicle, 324 km/h."""
 MIN_COURSE_SPEED_M_S = 2.0
-"""[m/s] from which the direction of travel is the vehicle's heading. Source: chosen by hand."""
+"""[m/s] from which the direction of travel is the vehicle's heading."""
 GAP_S, GAP_FACTOR = 1.0, 5.0
-"""[s, 1] least gap between the times of two frames that is stated, and over the usual interval. Source: by hand."""
+"""[s, 1] least gap between the times of two frames that is stated, and over the usual interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,10 +348,10 @@ def _some(names: Sequence[str] | set[str]) -> str:
 
 CSV_COLUMNS = ("time", "time_s", "source", "lon_deg", "lat_deg", "heading_deg", "sigma_m", "after_gap")
 MAX_STEP_S = 30.0
-"""[s] between two positions that are joined by a line. Source: chosen by hand; a receiver's are 5 s apart."""
+"""[s] between two positions that are joined by a line. A receiver's are 5 s apart."""
 MAX_STRAIGHT_S = 3.0
-"""[s] before the first and after the last tag for which its heading serves, where the recording has no headings.
-Source: chosen by hand; 36 m in a town, less than a bend."""
+"""[s] before the first and after the last tag for which its heading serves, where the recording has no headings. 36 m
+in a town, less than a bend."""
 Floats = npt.NDArray[np.float64]
 
 

@@ -433,12 +433,12 @@ def _plates(result: FrameResult) -> list[PlateReading]:
 
 
 RUN_FRAMES = 8
-"""Frames of a run at most. Source: by hand."""
+"""Frames of a run at most."""
 RUN_PIXELS = 20_000_000
-"""Pixels of a run at most, unless one frame has more. [px] Source: by hand; less than the largest frame, which must
+"""Pixels of a run at most, unless one frame has more. [px] Less than the largest frame, which must
 be decoded within the same time."""
 RUN_BYTES = 8 * 1024**2
-"""Bytes of a run at most, unless one frame has more. [byte] Source: by hand."""
+"""Bytes of a run at most, unless one frame has more. [byte]"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ _RECORDING = ("recording", "cut the recording into shorter ones")
 
 
 _MOTION_STEP_S = 0.1  # [s] source: app/tracks/time_base.py has a node every 0.1 s
-_MOTION_VALUES = 36_000  # at most; source: by hand, an hour, 0.5 MB of JSON
+_MOTION_VALUES = 36_000  # at most; an hour, 0.5 MB of JSON
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +191,7 @@ def compile_traces() -> None:
 
 
 MAX_POINTS = 200_000
-"""Points of each series at most. Source: chosen by hand; 2 MB of JSON for a series."""
+"""Points of each series at most. 2 MB of JSON for a series."""
 MAX_SERIES = 6
 DEFAULT_SERIES = ("vertical", "forward")
 _AXES = "xyz"

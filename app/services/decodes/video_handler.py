@@ -52,9 +52,9 @@ if TYPE_CHECKING:  # it loads numba
     from app.decoders.plate.video_search import FoundPlate
 
 POSE_EVERY_S = 0.5
-"""[s] between the poses along a segment by which markers are looked up. Source: chosen by hand; 15 m at 30 m/s."""
+"""[s] between the poses along a segment by which markers are looked up. 15 m at 30 m/s."""
 PART_EVERY = timedelta(seconds=10)
-"""Shortest time between two partial results. Source: chosen by hand: each is written whole."""
+"""Shortest time between two partial results. Each is written whole."""
 
 _DAMAGED, _OTHER_SIZE = "could not be decoded", "have another size than the video"
 

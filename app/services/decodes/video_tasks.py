@@ -27,9 +27,9 @@ if TYPE_CHECKING:  # it loads numba
     from app.decoders.plate.video_search import FoundPlate, PlateVideoSearch
 
 OTHER_STEP = 3
-"""[frames] of which one is searched for markers of other families than plates. Source: chosen by hand, for speed."""
+"""[frames] of which one is searched for markers of other families than plates. For speed."""
 MAX_BEYOND = 45
-"""[frames] after a segment in which a plate that is in view at its end is followed. Source: chosen by hand."""
+"""[frames] after a segment in which a plate that is in view at its end is followed."""
 _VIDEO = ("video", "record at a lower resolution")
 
 

@@ -17,13 +17,13 @@ from app.services.decodes.context import DecodeKind
 from app.tracks import Clock, LanePath, LeftOutReason, PositionFix, Samples, TrackInput
 
 SPEED_SIGMA_M_S = 0.1
-"""Noise of a vehicle's speed besides its scale. [m/s] Source: chosen by hand; a count of a wheel in 0.1 s is 5 cm."""
+"""Noise of a vehicle's speed besides its scale. [m/s] A count of a wheel in 0.1 s is 5 cm."""
 HEADING_SIGMA_DEG = 0.5
-"""Noise of a vehicle's heading besides its bias. [deg] Source: chosen by hand."""
+"""Noise of a vehicle's heading besides its bias. [deg]"""
 DEFAULT_CLOCK_SIGMA_S = 0.5
-"""Error of a clock that nothing is declared of. [s] Source: chosen by hand; a camera's clock set by NTP once a day."""
+"""Error of a clock that nothing is declared of. [s] A camera's clock set by NTP once a day."""
 MIN_RECEIVER_M = 0.02
-"""Least standard deviation of a receiver's position, both axes together. [m] Source: by hand; RTK, with its antenna."""
+"""Least standard deviation of a receiver's position, both axes together. [m] RTK, with its antenna."""
 _EPOCH_S = 1e9  # times beyond are seconds since 1970: no recording lasts 30 years
 _IN_USE = ("active", "surveyed", "built")
 

@@ -20,7 +20,7 @@ TRACK_FILES = {
     "plot.svg": "image/svg+xml",
 }
 """Files of a drive with their media types."""
-_DOUBTED = 2.5  # times the stated standard deviation of a receiver, above which a warning is given; source: by hand
+_DOUBTED = 2.5  # times the stated standard deviation of a receiver, above which a warning is given
 MAX_MARKERS = 2000
 """Markers in a drive's document; its GeoJSON has all."""
 

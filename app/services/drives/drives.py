@@ -31,7 +31,7 @@ from app.tracks.time_base import check_times
 from app.tracks.types import TrackRules
 
 MAX_DECODES = 100
-"""Decodes of a drive at most. Source: chosen by hand; a day of a test fleet's vehicle."""
+"""Decodes of a drive at most. A day of a test fleet's vehicle."""
 _FOLDER = "tracks"
 _WAIT_S = 60.0
 _COLLECTED, _WRITTEN = 0.1, 0.9

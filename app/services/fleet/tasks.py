@@ -18,9 +18,9 @@ from app.services.decoder_tasks import decoder_task, memory_is_the_limit
 
 MAX_PHOTOS = 60
 PROCESSOR_S = 30.0
-"""Time for all photos of a calibration. [s] Source: by hand, a second each of more than are needed."""
+"""Time for all photos of a calibration. [s] A second each of more than are needed."""
 WITHOUT_BOARD = 8
-"""Photos after which it is clear that none shows the board. Source: by hand, two thirds of those that are needed."""
+"""Photos after which it is clear that none shows the board. Two thirds of those that are needed."""
 _PHOTO = ("photo", "send photos at the camera's resolution")
 
 

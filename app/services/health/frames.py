@@ -31,9 +31,9 @@ from app.services.health.record import EVIDENCE, MISSED, FrameHealth, rounded
 SIGMAS_IN_ACCURACY = 3.0
 """Standard deviations in the accuracy of a coarse position, which holds the vehicle with near certainty."""
 MAX_POSITION_SIGMA_M = 1.0
-"""[m] of the vehicle's position, above which markers in view are not predicted. Source: by hand, two plates."""
+"""[m] of the vehicle's position, above which markers in view are not predicted. Two plates."""
 HEADING_SIGMA_RAD = math.radians(0.5)
-"""[rad] of the vehicle's heading. Source: chosen by hand; what changes less is the vehicle's own shift."""
+"""[rad] of the vehicle's heading. What changes less is the vehicle's own shift."""
 SURVEY_SIGMA_M = 0.7
 """[m] each axis, of a marker without a stated accuracy. Source: `ASSUMED_HORIZONTAL_RMSE_M`, both axes together."""
 MAX_SEEN_AHEAD_M = 18.0
@@ -42,12 +42,12 @@ MIN_EXPECTED = 0.3
 """Probability from which a plate that was not read is observed as missed. Source:
 `app.health.marker_tests.MIN_EXPECTED`."""
 GRADE_NOMINAL, GRADE_SIGMA = 3.0, 0.6
-"""Usual overall grade of a plate, and its standard deviation between passes. Source: by hand; the tests compare it with
-the other plates of the drive and with the plate's own record."""
+"""Usual overall grade of a plate, and its standard deviation between passes. The tests compare it with the other plates
+of the drive and with the plate's own record."""
 FORWARD_DEG, BACKWARD_DEG = 45.0, 135.0
 """[deg] of a plate's direction from straight ahead: met forward, and met in reverse. Source: half a quarter turn."""
 MIN_CONFIDENCE = 0.95
-"""Of a reading of a plate that is not registered. Source: by hand; decoders refuse what is less sure than 0.99."""
+"""Of a reading of a plate that is not registered. Decoders refuse what is less sure than 0.99."""
 FAR_M = 50.0
 """[m] beyond the coarse accuracy, from where a plate is elsewhere. Source: `app.health.marker_tests.SAME_PLACE_M`."""
 _ON_ROAD = frozenset({"built", "surveyed", "active", "suspect"})

@@ -168,7 +168,7 @@ MAX_REPORTS = 20
 """Reports that an item lists. Source: as `app.services.public_pages.reports.MAX_NEW_OF_MARKER`."""
 WRONG_WAY_EVENT = "maintenance.wrong-way-driver"
 MAX_UPLOADS = 5
-"""Uploads that an item links to. Source: chosen by hand, what a person looks at."""
+"""Uploads that an item links to. What a person looks at."""
 _NOT_ON_ROAD = frozenset({"planned", RETIRED})
 _SHOWN_DIGITS = 3
 _WITH_PLOT = frozenset({"trace", "packets"})

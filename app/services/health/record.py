@@ -134,8 +134,8 @@ def _rounded(value: Any, digits: int) -> Any:
 
 
 SAME_CODE_M = 30.0
-"""[m] readings of an unregistered code that are as near to each other are of one marker. Source: chosen by hand, what
-positions of vehicles without RTK are good to."""
+"""[m] readings of an unregistered code that are as near to each other are of one marker. What positions of vehicles
+without RTK are good to."""
 _SAME_PLACE_DEG = 1e-7  # a centimetre: the registered position is the same
 CAMERA, BAR, RADIO = "camera", "bar", "radio"
 """Sensors: each of a vehicle has errors of its own."""

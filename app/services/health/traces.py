@@ -38,31 +38,31 @@ from app.services.health.record import EVIDENCE, MISSED, rounded
 
 NEAR_M = 60.0
 """[m] from a marker, within which its packets are strong enough. Source: the CERPM paper, section 4.1: at most
-340 m; by hand, a sixth of it, so that only collisions lose packets."""
+340 m. A sixth of it, so that only collisions lose packets."""
 RECEIVED_SHARE = 0.7
 """Share of strong transmissions that are received. Source: 0.72 by ALOHA in `cerpm-radio` (docs/benchmarks.md)."""
 MAX_PROBABILITY = 0.97
-"""Of receiving a marker at all. Source: by hand; a truck beside the vehicle shades it."""
+"""Of receiving a marker at all. A truck beside the vehicle shades it."""
 MIN_TRANSMISSIONS = 2.0
-"""Near a marker, without which a miss is no evidence. Source: by hand."""
+"""Near a marker, without which a miss is no evidence."""
 TWO_PLACES_M = 5.0
-"""[m] between places in messages of one number, from where they are of two markers. Source: by hand; a marker that is
-programmed again after a better survey moves by less."""
+"""[m] between places in messages of one number, from where they are of two markers. A marker that is programmed again
+after a better survey moves by less."""
 SEEN, MOVED, CLONED, WRONG_WAY = "seen", "moved", "cloned", "wrong-way"
 """What was observed of a marker."""
 MAX_TRACK_M = 50_000.0
 MAX_MARKERS = 1000
 MESSAGE_SIGMA_M = 0.1
-"""[m] each axis, by which positions in messages are rounded and of other epochs. Source: by hand."""
+"""[m] each axis, by which positions in messages are rounded and of other epochs."""
 CERPM_SURVEY_SIGMA_M = 0.35
 """[m] each axis, without a stated accuracy: markers agree with messages within half a metre (`MergeRules.apart_m`)."""
 MIN_LEVEL_SIGMA_DB = 2.0
 """[dB] least standard deviation of a level between drives: another car, another lane. Source: `WEAK_DB` is -6 dB."""
 LANE_M, MIN_OF_A_SIDE, SIDE_SHARE = 4.0, 2, 0.8
 """[m] beside the vehicle, within which a marker is of its lane; markers of each side that show a direction, and the
-share of each that must agree. Source: by hand; a lane is at most 3.75 m wide, and half a lane of error hides a side."""
+share of each that must agree. A lane is at most 3.75 m wide, and half a lane of error hides a side."""
 _ON_ROAD = frozenset({"built", "surveyed", "active", "suspect"})
-_MAX_STEP_S = 2.0  # [s] between two poses of the track, for the time near a marker; source: by hand
+_MAX_STEP_S = 2.0  # [s] between two poses of the track, for the time near a marker
 
 
 def packet_evidence(read: ReadPackets, row: MarkerRow, kind: Disagreement | None, files: DriveFiles) -> dict[str, Any]:
@@ -220,20 +220,20 @@ def with_evidence(
 
 
 MIN_TAGS = 4
-"""Tags of a drive from which the odometer's scale is known. Source: by hand; of three, one may have moved."""
+"""Tags of a drive from which the odometer's scale is known. Of three, one may have moved."""
 MAX_GAP_M = 300.0
-"""[m] between tags whose path between them is known. Source: by hand."""
+"""[m] between tags whose path between them is known."""
 ODOMETER_SHARE = 0.002
-"""Standard deviation of the odometer over a distance, after its scale is taken out. Source: by hand."""
+"""Standard deviation of the odometer over a distance, after its scale is taken out."""
 SURVEY_SIGMA_M = 0.7
 """[m] each axis, without a stated accuracy. Source: `ASSUMED_HORIZONTAL_RMSE_M`, both axes together."""
 WANDER_M, WANDER_PER_M = 0.1, 0.002
-"""[m, 1] standard deviation of the path between two tags from the curve through both. Source: by hand."""
+"""[m, 1] standard deviation of the path between two tags from the curve through both."""
 MAX_BEND = 0.02
-"""Share by which the way driven may exceed the straight line between two tags. Source: by hand, 0.7 rad of a bend."""
+"""Share by which the way driven may exceed the straight line between two tags. 0.7 rad of a bend."""
 SIGNAL_SIGMA = 0.06
-"""Standard deviation of the logarithm of a tag's mean moment between passes. Source: by hand, twice the 0.03 of
-simulated passes at a clearance of 28 cm (0.02 at 16 cm); the decoder reads tags down to about 0.65 of their moment."""
+"""Standard deviation of the logarithm of a tag's mean moment between passes. Twice the 0.03 of simulated passes at a
+clearance of 28 cm (0.02 at 16 cm); the decoder reads tags down to about 0.65 of their moment."""
 FAR_M = 50.0
 """[m] from its place, from where a tag is elsewhere. Source: `app.health.marker_tests.SAME_PLACE_M`; a bend that
 `MAX_BEND` allows between tags `MAX_GAP_M` apart is 41 m beside the straight line."""

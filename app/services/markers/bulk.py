@@ -24,7 +24,7 @@ from app.services.request_work import check_deadline
 Mode: TypeAlias = Literal["all", "good"]
 ALL: Mode = "all"
 GOOD: Mode = "good"
-MAX_PARTS = 10_000  # magnets and other markers of the items; source: by hand, one to three seconds of a processor
+MAX_PARTS = 10_000  # magnets and other markers of the items; one to three seconds of a processor
 _CREATED, _UPDATED = 201, 200
 
 

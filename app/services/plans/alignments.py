@@ -28,9 +28,9 @@ from app.services.plans.tasks import MapForm, RoadFile, profile_road, summarize_
 from app.services.ports import Blobs, Clock, DecoderProcesses
 
 BUSY_WAIT_S = 10.0
-"""How long a request waits for a decoder process. [s] Source: chosen by hand, as imports."""
+"""How long a request waits for a decoder process. [s] As imports."""
 MAX_MAP_MARKERS = 50_000
-"""Markers around a road that a map is chosen from. Source: chosen by hand, bounds the memory."""
+"""Markers around a road that a map is chosen from. Bounds the memory."""
 _DECLARED = frozenset(field.name for field in fields(AlignmentDeclaration))
 
 

@@ -14,7 +14,7 @@ from app.services.documents import document_of
 from app.services.plans.documents import AsBuiltDocument, BuiltMarker, CheckComparison, FindingDocument
 
 MAX_LISTED = 1000
-"""Markers that the comparison lists; all are counted. Source: chosen by hand."""
+"""Markers that the comparison lists; all are counted."""
 SURVEYED = ("surveyed", "active", "suspect")
 """Statuses of markers that were surveyed."""
 

@@ -27,8 +27,8 @@ from app.services.plans.tasks import MadePlan
 from app.services.ports import Clock, JobQueue
 
 IMMEDIATE_LANES_M = 20_000.0
-"""Plans of roads with lanes up to this length are made while the caller waits, longer ones by jobs. [m]
-Source: chosen by hand, some seconds with all families."""
+"""Plans of roads with lanes up to this length are made while the caller waits, longer ones by jobs. [m] Some seconds
+with all families."""
 _STARTED = 0.1
 
 
@@ -101,8 +101,8 @@ class PlanMaking:
 
 _NAME = "preview"
 MAX_MARKERS = 10_000
-"""Markers of a page: 1.7 MB. Source: chosen by hand, as pages of features."""
-_KEPT = 4  # previews whose further pages need no computation; a large one takes 5 MB compressed; chosen by hand
+"""Markers of a page: 1.7 MB. As pages of features."""
+_KEPT = 4  # previews whose further pages need no computation; a large one takes 5 MB compressed
 
 
 class PlanPreviews:

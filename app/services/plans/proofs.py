@@ -42,8 +42,7 @@ KeyT = TypeVar("KeyT")
 ArgumentsT = TypeVarTuple("ArgumentsT")
 ResultT = TypeVar("ResultT")
 WAIT_S = 60.0
-"""How long a job waits for a place among the tasks of the decoder processes before it is put back. [s]
-Source: chosen by hand, as decodes."""
+"""How long a job waits for a place among the tasks of the decoder processes before it is put back. [s] As decodes."""
 
 
 def results_as_done(

@@ -64,10 +64,10 @@ if TYPE_CHECKING:  # it loads numba
 
 
 MAX_LISTED = 1000
-"""Events, warnings and places left out that a summary lists; all are counted. Source: chosen by hand."""
+"""Events, warnings and places left out that a summary lists; all are counted."""
 MAX_WEAK = 100
-"""Weak markers that the document of a plan lists; its report has all. Source: chosen by hand."""
-_STRAIGHT_PER_M = 1e-5  # [1/m] below it a lane is straight; source: chosen by hand, a radius of 100 km
+"""Weak markers that the document of a plan lists; its report has all."""
+_STRAIGHT_PER_M = 1e-5  # [1/m] below it a lane is straight; a radius of 100 km
 
 
 def road_summary(road: Alignment, format_name: str = "") -> RoadSummary:
@@ -155,8 +155,8 @@ def _lane_summary(lane: Lane) -> LaneSummary:
 
 
 MAX_SAMPLES = 5_000
-"""Of one lane. Source: chosen by hand, more than a screen has columns."""
-_MAX_ALL_SAMPLES = 100_000  # of all lanes together; source: chosen by hand, 5 MB of JSON
+"""Of one lane. More than a screen has columns."""
+_MAX_ALL_SAMPLES = 100_000  # of all lanes together; 5 MB of JSON
 _DECIMALS = 9  # of degrees, 0.1 mm; source: as maps of plans
 
 

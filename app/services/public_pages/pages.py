@@ -32,11 +32,11 @@ from app.services.ports import Clock
 
 
 MIN_AGE_S = 3
-"""Nobody fills the form in faster. [s] Source: chosen by hand."""
+"""Nobody fills the form in faster. [s]"""
 MAX_AGE_S = 6 * 3600
-"""Time in which a form has to be sent. [s] Source: chosen by hand: photographed on the road, sent at home."""
+"""Time in which a form has to be sent. [s] Photographed on the road, sent at home."""
 _CLOCK_ERROR_S = 60
-"""How far the clocks of servers may differ. [s] Source: chosen by hand."""
+"""How far the clocks of servers may differ. [s]"""
 _PURPOSE = b"waymark damage report form 1"
 _TIME_BYTES, _NONCE_BYTES, _TAG_BYTES = 6, 12, 16
 

@@ -37,7 +37,7 @@ from app.services.public_pages.tasks import write_report_photo
 from app.services.uploads.quotas import Quotas
 
 MAX_NEW_OF_MARKER, MAX_NEW_OF_AGENCY = 20, 2000
-"""Reports that may wait for a decision. Source: chosen by hand: more of one marker add no information."""
+"""Reports that may wait for a decision. More of one marker add no information."""
 RECEIVED, DECIDED = "report.received", "report.decided"
 """Kinds of events."""
 _BUSY_WAIT_S = 10.0

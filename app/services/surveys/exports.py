@@ -159,7 +159,7 @@ def _blocks(path: Path, folder: TemporaryDirectory[str]) -> Iterator[bytes]:
 
 SUFFIXES = {"shapefile": "shp.zip", "landxml": "xml"}
 MAX_LEFT_OUT_IDS = 20
-"""Ids in the header Waymark-Left-Out. Source: chosen by hand, 1 kB."""
+"""Ids in the header Waymark-Left-Out. 1 kB."""
 _WRITING = 0.95
 """Progress when all markers are read; GDAL then closes the file."""
 

@@ -31,7 +31,7 @@ from app.surveys.georeference import GeoreferencedSurvey, LocalGridDocument
 
 _MAX_TEXT_BYTES, _MAX_FIELD_BYTES = 320, 120  # source: a report of a thousand faults then takes less than 1 MB
 MAX_RESIDUALS = 1000
-"""Rows of a comparison that a report has the residuals of. Chosen by hand."""
+"""Rows of a comparison that a report has the residuals of."""
 Outcome = Literal["checked", "stored", "refused"]
 RowState = Literal["good", "warning", "refused", "left-out"]
 
@@ -215,7 +215,7 @@ def merge_patch(changes: Sequence[Change]) -> dict[str, JsonValue] | None:
 ALL: Final = "all"
 MAX_FAULTS = 1000
 MAX_ROWS_LISTED = 2000
-"""Rows of a survey that a report can list; about 200 kB. Chosen by hand."""
+"""Rows of a survey that a report can list; about 200 kB."""
 _ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
 _MAX_CELL = 80
 

@@ -115,7 +115,7 @@ def _check_stored(
 
 
 MAX_NEIGHBOURS = 50_000
-"""Registered markers that a survey is compared with at most. Chosen by hand, to bound memory."""
+"""Registered markers that a survey is compared with at most. To bound memory."""
 _MARGIN_DEG = NEAR_M / 90_000.0
 
 

@@ -68,7 +68,7 @@ def upload_document(row: UploadRow) -> UploadDocument:
 
 
 _VALID_S = 5.0
-"""How long sums are remembered for the check before a body. [s] Chosen by hand; `count` checks exactly."""
+"""How long sums are remembered for the check before a body. [s] `count` checks exactly."""
 _MAX_REMEMBERED = 10_000
 _CURE = "delete open uploads with DELETE /v1/uploads/{id}, or ask the operator for a larger quota"
 

@@ -50,9 +50,9 @@ LOCK = timedelta(seconds=30)
 """How long a request may write without a sign of life. Source: `Settings.body_timeout_s`, after which a body that
 stands still is given up."""
 COMPOSING = timedelta(minutes=10)
-"""The same while the parts become one file: 4 GiB at 10 MB/s. Chosen by hand."""
+"""The same while the parts become one file: 4 GiB at 10 MB/s."""
 KEPT = timedelta(days=7)
-"""How long an upload can be asked about after it ended. Chosen by hand."""
+"""How long an upload can be asked about after it ended."""
 _LOG = structlog.get_logger(__name__)
 
 

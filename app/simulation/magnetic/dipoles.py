@@ -72,8 +72,8 @@ def add_static_field(out, points, axes, chainage, dipoles, at, reach):  # type: 
 
 
 _ALONG_AXIS = 3
-"""Gauss-Legendre nodes along the axis. Source: by hand; as far from a face as the magnet is long or wide the field on
-the axis is good to 2 %, at three times that to 0.1 % (tests/simulation/test_magnetic_physics.py)."""
+"""Gauss-Legendre nodes along the axis. As far from a face as the magnet is long or wide the field on the axis is good
+to 2 %, at three times that to 0.1 % (tests/simulation/test_magnetic_physics.py)."""
 _ACROSS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 """Directions of the four nodes of a cross section, at its radius over sqrt(2): exact for polynomials of degree 3 on a
 disc. Source: Abramowitz and Stegun 1964, 25.4.61."""

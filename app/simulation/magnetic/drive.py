@@ -26,7 +26,7 @@ Floats = npt.NDArray[np.float64]
 
 MPH = 0.44704
 """A mile per hour. [m/s] Source: international mile of 1609.344 m."""
-_STEP_S = 0.005  # [s] of the motion; source: by hand, well below the 9 to 13 Hz of the axle
+_STEP_S = 0.005  # [s] of the motion; well below the 9 to 13 Hz of the axle
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +186,7 @@ def wheel_field_ut(vehicle: Vehicle, motion: Motion, yaw_rate: Floats, t_s: Floa
 
 EARTH_UT = (0.0, 18.0, -51.0)
 """The earth's field in southern Michigan, east, north, up. [uT] Source: rounded by hand, without declination."""
-_REACH_M, _FAR_M = 3.0, 14.0  # [m] reach of a magnet's and of a car's field; source: by hand, below 0.02 uT
+_REACH_M, _FAR_M = 3.0, 14.0  # [m] reach of a magnet's and of a car's field; below 0.02 uT
 _BLOCK = 8192  # samples that are rendered at a time; bounds the memory
 
 

@@ -13,7 +13,7 @@ from app.markers.magnet import MOMENT_AM2, InformationTag, Orientation, Polarity
 
 Floats = npt.NDArray[np.float64]
 
-_STEP_M = 0.25  # [m] between points of the centre line; source: by hand, 4 mm of sagitta at 2 m radius
+_STEP_M = 0.25  # [m] between points of the centre line; 4 mm of sagitta at 2 m radius
 
 
 class Road:

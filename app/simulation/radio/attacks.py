@@ -13,8 +13,8 @@ from app.markers.cerpm import BODY_BYTES, MESSAGE_BYTES, TAG_BYTES
 from app.sensors.pose_track import ReceivedPacket
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane
 
-_ON_THE_LINE_M = 1.0  # [m] from a boundary, where a wrong position is not detectable; source: by hand
-_TRIES = 1000  # source: by hand, bounds the search
+_ON_THE_LINE_M = 1.0  # [m] from a boundary, where a wrong position is not detectable
+_TRIES = 1000  # bounds the search
 
 
 def move_claim(

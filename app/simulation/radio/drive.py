@@ -30,11 +30,11 @@ from app.simulation.radio.link import (
 Floats = npt.NDArray[np.float64]
 
 MPH = 0.44704  # [m/s] source: definition
-_TICK_S = 0.05  # [s] source: by hand, the 20 Hz of RTK receivers
+_TICK_S = 0.05  # [s] the 20 Hz of RTK receivers
 _LATERAL_M_S2 = 2.5  # [m/s2] source: assumed, comfortable bends
 _CURVATURE_SD_M = 15.0  # [m] Gaussian over which drivers look at bends; source: assumed, a second of driving
-_SLOW_BEFORE_M = 60.0  # [m] over which speed is reduced about a bend; source: assumed, no measurement kept
-_SPEED_SD, _SPEED_LENGTH_M = 0.05, 60.0  # share and length [m] of uneven speed; source: assumed, no measurement kept
+_SLOW_BEFORE_M = 60.0  # [m] over which speed is reduced about a bend; assumed
+_SPEED_SD, _SPEED_LENGTH_M = 0.05, 60.0  # share and length [m] of uneven speed; assumed
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +275,7 @@ Ints = npt.NDArray[np.int64]
 Sign = Callable[[CerpmMessage], bytes]
 
 _SNR_LIMITS_DB = (-20.0, 12.0)  # [dB] source: range that LoRa receivers report
-_SNR_SD_DB = 0.5  # [dB] of a reported SNR; source: assumed, no measurement kept
+_SNR_SD_DB = 0.5  # [dB] of a reported SNR; assumed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,10 +19,10 @@ from app.markers.cerpm import DEGREE_STEP, LaneSide, SpeedLimit
 Floats = npt.NDArray[np.float64]
 Origin = tuple[float, float, float]
 
-STEP_M = 0.25  # [m] between stations; source: by hand, an eighth of the smoothing of 2.2 m
-_MAX_CURVATURE_1PM = 0.04  # [1/m] source: by hand, a radius of 25 m
-_CAR_SMOOTHING_M = 3.0  # [m] source: by hand, about a wheelbase
-_MAX_TURN_RAD = 2.2  # [rad] of the direction against the first one, so that lanes do not cross themselves; by hand
+STEP_M = 0.25  # [m] between stations; an eighth of the smoothing of 2.2 m
+_MAX_CURVATURE_1PM = 0.04  # [1/m] a radius of 25 m
+_CAR_SMOOTHING_M = 3.0  # [m] about a wheelbase
+_MAX_TURN_RAD = 2.2  # [rad] of the direction against the first one, so that lanes do not cross themselves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +215,7 @@ def _smoothed(points_m: Floats, step_m: float) -> Floats:
 Ints = npt.NDArray[np.int64]
 
 SURVEY_SD_M = 0.02  # [m] of a surveyed coordinate, each axis; source: Trimble Catalyst DA2, CERPM paper, section 2.2
-_PLACING_SD_M = 0.01  # [m] of placing a marker, each axis; source: assumed, no measurement kept
+_PLACING_SD_M = 0.01  # [m] of placing a marker, each axis; assumed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

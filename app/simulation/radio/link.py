@@ -152,8 +152,8 @@ class Radio:
     bandwidth_hz: int = 500_000  # [Hz] 125, 250 or 500 kHz
     # `interval_s`, `jitter`: [s] between transmissions of a marker, and the maximum share of it by which each is early
     # or late, below half
-    interval_s: float = 2.0  # [s] source: by hand, no measurement kept
-    jitter: float = 0.1  # source: by hand, no measurement kept
+    interval_s: float = 2.0  # [s]
+    jitter: float = 0.1
     payload_bytes: int = MESSAGE_BYTES  # [bytes]
     preamble_symbols: int = 8  # programmed length
     # of the preamble's end that the receiver needs undisturbed to lock (Bor et al. 2016: five).

@@ -35,7 +35,7 @@ numbers OpenDRIVE's own catalogue uses; MUTCD R1-1 and R2-1."""
 _STOP_LINE = re.compile(r"stop[ _-]?line", re.IGNORECASE)
 _CROSSING = re.compile(r"cross[ _-]?walk|zebra", re.IGNORECASE)
 _SAME_PLACE_M = 5.0
-"""A sign this near to a change of the lane's limit says the same. [m] Source: chosen by hand."""
+"""A sign this near to a change of the lane's limit says the same. [m]"""
 
 
 class Furniture(NamedTuple):
@@ -219,7 +219,7 @@ def _carriageway(road: Road, grid: Grid, start: float, end: float) -> Floats | N
 
 
 MAX_WARNINGS = 100
-"""Warnings that are kept, the number of the others in one more. Source: chosen by hand."""
+"""Warnings that are kept, the number of the others in one more."""
 Offset = tuple[float, float, float, float]
 """header/offset: x, y, z [m], hdg [rad]."""
 

@@ -288,9 +288,9 @@ def speed_mps(speed: ET.Element, place: str) -> float:
 
 
 MIN_WIDTH_M = 0.05
-"""Stretches of lanes that are narrower are left out. [m] Source: chosen by hand; tapers begin and end at zero width."""
+"""Stretches of lanes that are narrower are left out. [m] Tapers begin and end at zero width."""
 _MIN_STRETCH = 0.02
-"""Length of a lane per length of the reference line; with less it lies at the centre of a bend. Source: by hand."""
+"""Length of a lane per length of the reference line; with less it lies at the centre of a bend."""
 _SAME = (1e-6, 1e-6, 1e-3, 1e-6)
 """Changes of curvature [1/m], superelevation [rad], width [m] and speed [m/s] that are none. Source: rounding."""
 _X, _Y, _Z, _K, _ROLL, _WIDTH, _SPEED, _S, _OK = range(9)
