@@ -35,7 +35,7 @@ class Answer:
     ----------
     replayed : bool
         The request was answered before under the same key; `response` is that answer.
-    response : Any
+    response : object
         JSON, as it was stored; None while there is none.
     """
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, cast
+from typing import Annotated, NotRequired, cast
 
 import sqlalchemy as sa
 import structlog
@@ -178,7 +178,7 @@ class EventDocument(TypedDict):
     kind: Annotated[str, Field(description="For example job.done.")]
     subject_id: str | None
     at: datetime
-    detail: dict[str, Any] | None
+    detail: dict[str, object] | None
 
 
 class EventPage(TypedDict):

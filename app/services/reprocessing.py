@@ -75,7 +75,7 @@ class _Reading(NamedTuple):
     place: tuple[float, float] | None = None
 
 
-def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> Comparison:
+def compare_results(before: Mapping[str, object], after: Mapping[str, object]) -> Comparison:
     """How the readings of a result differ from those of an earlier one, whatever the kind of upload.
 
     A reading is the same if its family, its frame or time, and its code are; what is left over at the same place of
@@ -160,7 +160,7 @@ def _distance_m(one: _Reading, other: _Reading) -> float | None:
     return float(_WGS84.inv(*one.place, *other.place)[2])
 
 
-def _by_place(result: Mapping[str, Any]) -> dict[tuple[str, int | None], list[_Reading]]:
+def _by_place(result: Mapping[str, object]) -> dict[tuple[str, int | None], list[_Reading]]:
     found: dict[tuple[str, int | None], list[_Reading]] = defaultdict(list)
     for reading in _readings(result):
         found[reading.family, reading.frame].append(reading)
@@ -580,7 +580,7 @@ def _is_inside(context: Mapping[str, Any], bbox: tuple[float, float, float, floa
     return bool(across and south <= lat <= north)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     return value.isoformat() if isinstance(value, datetime) else list(value) if isinstance(value, tuple) else value
 
 

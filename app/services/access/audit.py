@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 import sqlalchemy as sa
 from pydantic import Field, JsonValue
@@ -121,7 +121,7 @@ def log_change(
     now: datetime,
     subject: str | None = None,
     document: Mapping[str, object] | None = None,
-    **detail: Any,
+    **detail: object,
 ) -> None:
     """Append an entry for a change that writes no versions of markers.
 

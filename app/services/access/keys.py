@@ -258,7 +258,7 @@ class Agencies:
                 connection, text, agency_id=agency_id, scope=Scope.ADMIN, label=label, now=now, author=author
             )
             log_change(connection, caller, "agency.created", now=now, subject=agency_id, name=name)
-            document: dict[str, Any] = {
+            document: dict[str, object] = {
                 "id": agency_id, "name": name, "created_at": now.isoformat(),
                 "admin_key": {
                     "id": key_id, "holder_id": key_id, "label": label, "scope": Scope.ADMIN, "prefix": shown_part(text),

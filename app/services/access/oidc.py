@@ -124,7 +124,7 @@ class Tokens:
         digest = hashlib.sha256(f"{self._issuer.issuer}\n{subject}".encode("utf-8", "replace")).hexdigest()
         return Bearer(agency, f"oidc:{digest[:32]}", _label(claims, subject), scopes.pop(), _ends_at(claims))
 
-    def _claims(self, token: str) -> dict[str, Any]:
+    def _claims(self, token: str) -> dict[str, object]:
         try:
             if len(token) > MAX_TOKEN_CHARACTERS:
                 raise jwt.InvalidTokenError("it is too long")
@@ -134,7 +134,7 @@ class Tokens:
             key = self._keys.find(header.get("kid"))
             if key is None:
                 raise jwt.InvalidTokenError("its key is not the issuer's")
-            claims: dict[str, Any] = jwt.decode(
+            claims: dict[str, object] = jwt.decode(
                 token,
                 key=key,
                 algorithms=[key.algorithm_name],
@@ -182,16 +182,16 @@ def _usable_keys(content: bytes) -> dict[str | None, jwt.PyJWK]:
     return usable
 
 
-def _claim(claims: Mapping[str, Any], name: str) -> Any:
+def _claim(claims: Mapping[str, object], name: str) -> object:
     if name in claims:
         return claims[name]
-    found: Any = claims
+    found: object = claims
     for part in name.split("."):
         found = found.get(part) if isinstance(found, Mapping) else None
     return found
 
 
-def _label(claims: Mapping[str, Any], subject: str) -> str:
+def _label(claims: Mapping[str, object], subject: str) -> str:
     name = claims.get("preferred_username")
     label = name if isinstance(name, str) and name.strip() else subject
     return "".join(c if c.isprintable() else "?" for c in label)[:200]

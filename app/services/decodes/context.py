@@ -245,7 +245,7 @@ class CameraSetup:
 class ContextInput:
     """The context as it was sent with an upload, before its vehicle's profile completes it."""
 
-    stated: dict[str, Any] = field(default_factory=dict)  # members of the context that were sent and nothing else
+    stated: dict[str, object] = field(default_factory=dict)  # members of the context that were sent and nothing else
     vehicle: str | None = None  # name or id of the vehicle
     file_name: str = ""  # of the file; empty where it has none
 
@@ -261,12 +261,12 @@ class DecodeContext:
     thermal_range: tuple[float, float] | None = None  # [counts] counts that become 0 and 255 in 16-bit thermal frames
     captured_at: datetime | None = None  # aware
     # the upload is a magnetometer trace, declared like this (`app.services.decodes.declarations.trace_terms`)
-    trace: dict[str, Any] | None = None
+    trace: dict[str, object] | None = None
     # the upload is a packet log, declared like this (`app.services.decodes.declarations.packet_terms`)
-    packets: dict[str, Any] | None = None
+    packets: dict[str, object] | None = None
     # frame rate, list and track of the frames of a drive, declared like this
     # (`app.services.decodes.declarations.frame_terms`)
-    frames: dict[str, Any] | None = None
+    frames: dict[str, object] | None = None
     # id, name and version of the vehicle, and the source of each member (`app.services.fleet.vehicles.inherit`)
     vehicle: dict[str, Any] | None = None
     file_name: str | None = None  # of the uploaded file, for people
@@ -306,7 +306,7 @@ class DecodeContext:
                 cure="add Z for UTC",
             )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """The context as it is stored: the members that have a value."""
         stated = _without_none(asdict(replace(self, trace=None, packets=None, frames=None, vehicle=None)))
         document = {name: value for name, value in stated.items() if value is not False}
@@ -336,7 +336,7 @@ def context_from_document(document: dict[str, Any]) -> DecodeContext:
     return context
 
 
-def _without_none(values: dict[str, Any]) -> dict[str, Any]:
+def _without_none(values: dict[str, object]) -> dict[str, object]:
     return {
         name: _without_none(value) if isinstance(value, dict) else value
         for name, value in values.items()

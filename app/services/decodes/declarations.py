@@ -115,7 +115,7 @@ def _declaration(declared: Mapping[str, Any], bar: MagnetometerBar) -> TraceDecl
     )
 
 
-def _columns(declared: Mapping[str, Any]) -> TraceColumns:
+def _columns(declared: Mapping[str, object]) -> TraceColumns:
     kinds: dict[str, Any] = {"time_unit": TimeUnit, "speed_unit": SpeedUnit, "heading_unit": AngleUnit}
     values: dict[str, Any] = {name: kinds.get(name, lambda same: same)(value) for name, value in declared.items()}
     if "field" in values:

@@ -65,7 +65,7 @@ class Decodes:
         blobs: Blobs,
         quotas: Quotas,
         queue: JobQueue,
-        handlers: Sequence[UploadHandler[Any]],
+        handlers: Sequence[UploadHandler[object]],
         rules: DecodeRules | None = None,
     ) -> None:
         self._database, self._clock = database, clock
@@ -181,12 +181,12 @@ class Decodes:
 
 TrackForm = Literal["geojson", "csv", "gpx"]
 ReadingsForm = Literal["geojson", "csv"]
-_TRACK_WRITERS: Mapping[str, Callable[[DecodeRow], Any]] = {
+_TRACK_WRITERS: Mapping[str, Callable[[DecodeRow], object]] = {
     "geojson": track_geojson,
     "csv": track_csv,
     "gpx": track_gpx,
 }
-_READING_WRITERS: Mapping[str, Callable[[DecodeRow], Any]] = {"geojson": readings_geojson, "csv": readings_csv}
+_READING_WRITERS: Mapping[str, Callable[[DecodeRow], object]] = {"geojson": readings_geojson, "csv": readings_csv}
 
 
 MAX_PACKETS = 20_000
@@ -292,7 +292,7 @@ class DecodeDetails:
             files = self._processes.run(read_drive, name, file, declared, rules.packets, rules.images)
         return _packets(files.packets, files.track, row.result or {})
 
-    def track(self, caller: Caller, decode_id: str, form: TrackForm) -> Any:
+    def track(self, caller: Caller, decode_id: str, form: TrackForm) -> object:
         """The vehicle's track: a text, or a document for ``geojson``.
 
         Raises
@@ -310,7 +310,7 @@ class DecodeDetails:
             )
         return _TRACK_WRITERS[form](row)
 
-    def readings(self, caller: Caller, decode_id: str, form: ReadingsForm) -> Any:
+    def readings(self, caller: Caller, decode_id: str, form: ReadingsForm) -> object:
         """All readings in the order of their times: a text, or a document for ``geojson``.
 
         Raises
@@ -368,7 +368,7 @@ def _packets(packets: Sequence[ReceivedPacket], track: PoseTrack | None, result:
     }
 
 
-def _verdict(entry: int, refused: Mapping[int, Mapping[str, Any]], last: int | None) -> str | None:
+def _verdict(entry: int, refused: Mapping[int, Mapping[str, object]], last: int | None) -> str | None:
     if entry in refused:
         return str(refused[entry]["verdict"])
     return "accepted" if last is None or entry <= last else None
@@ -396,6 +396,6 @@ def _number(packet: ReceivedPacket) -> int | None:
         return None
 
 
-def _listed(values: Any, places: int) -> list[float | None]:
+def _listed(values: object, places: int) -> list[float | None]:
     rounded: list[float] = np.round(np.asarray(values, float), places).tolist()
     return [value if np.isfinite(value) else None for value in rounded]

@@ -151,7 +151,7 @@ class ReadingPlace(TypedDict):
     fix: FixDocument | None
 
 
-def _in_frame(document: Any) -> Any:
+def _in_frame(document: Any) -> object:
     return types.new_class(f"{document.__name__}InFrame", (ReadingPlace, document))
 
 
@@ -338,7 +338,7 @@ def _pose(pose: FramePose | None) -> FramePoseDocument | None:
     }
 
 
-def _reading(marker: ReadMarker) -> dict[str, Any]:
+def _reading(marker: ReadMarker) -> dict[str, object]:
     reading = marker.reading
     return {
         **FRAME_READERS[reading.family].document(reading),

@@ -192,7 +192,7 @@ def _track_agreement(found: TrackAgreement | None) -> TrackAgreementDocument | N
     }
 
 
-def lane_geojson(lane: DecodedLaneDocument, markers: Sequence[Mapping[str, Any]]) -> LaneCollection:
+def lane_geojson(lane: DecodedLaneDocument, markers: Sequence[Mapping[str, object]]) -> LaneCollection:
     """Path, boundaries and markers of a stored lane, RFC 7946."""
     stations = lane["stations"]
     path = [list(place) for place in zip(stations["lon_deg"], stations["lat_deg"], strict=True)]

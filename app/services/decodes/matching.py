@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import sqlalchemy as sa
@@ -391,7 +391,7 @@ def lane_markers(merged: MergedMarkers) -> LaneMarkers:
     )
 
 
-def spans_of(verification: Verification) -> list[dict[str, Any]]:
+def spans_of(verification: Verification) -> list[dict[str, object]]:
     """The accepted transmissions, as the registry stores them."""
     return [
         {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -54,7 +54,7 @@ class DriveFiles:
 def read_drive(
     name: str,
     file: SpooledFile,
-    declared: Mapping[str, Any],
+    declared: Mapping[str, object],
     limits: PacketLimits = PacketLimits(),
     images: ImageLimits = ImageLimits(),
 ) -> DriveFiles:

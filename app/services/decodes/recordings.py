@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
 from functools import partial
-from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -209,7 +208,7 @@ def _observations(trace: ReadTrace, observed_at: datetime) -> list[NewObservatio
     return list(rows.values())
 
 
-def _what(wrong_way: bool, evidence: dict[str, Any]) -> str:
+def _what(wrong_way: bool, evidence: dict[str, object]) -> str:
     if evidence.get("two_places"):
         return "cloned"
     if "elsewhere_deg" in evidence:

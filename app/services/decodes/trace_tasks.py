@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -64,7 +64,7 @@ class TraceResult:
 def decode_recording(
     name: str,
     file: SpooledFile,
-    declared: Mapping[str, Any],
+    declared: Mapping[str, object],
     tags: tuple[str, ...] = (),
     formats: tuple[TagFormat, ...] = (),
     limits: TraceLimits = TraceLimits(),
@@ -226,7 +226,7 @@ class SamplesDocument(TypedDict):
 def read_samples(
     name: str,
     file: SpooledFile,
-    declared: Mapping[str, Any],
+    declared: Mapping[str, object],
     series: tuple[str, ...],
     from_s: float | None,
     to_s: float | None,

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from functools import partial
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import ClassVar, Generic, Literal, TypeVar
 
 import sqlalchemy as sa
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
@@ -84,7 +84,7 @@ class Decoded:
 
     document: FramesResult | TraceResultDocument | PacketsResult  # the result
     observations: Sequence[NewObservation] = ()
-    spans: Sequence[dict[str, Any]] = ()  # transmissions of CERPMs that were received
+    spans: Sequence[dict[str, object]] = ()  # transmissions of CERPMs that were received
     incidents: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # for the audit log: details by action
     unregistered: Sequence[NewUnregistered] = ()  # markers that were read where none is registered
 

@@ -88,12 +88,12 @@ def check_profile(profile: Mapping[str, Any]) -> None:
             packet_terms(profile["packets"])
 
 
-def has_intrinsics(camera: Mapping[str, Any]) -> bool:
+def has_intrinsics(camera: Mapping[str, object]) -> bool:
     """Whether a camera states its projection, completely or in part."""
     return any(camera.get(name) is not None for name in (*INTRINSICS, "horizontal_fov_deg"))
 
 
-def context_camera(camera: Mapping[str, Any] | None) -> Object | None:
+def context_camera(camera: Mapping[str, object] | None) -> Object | None:
     """A vehicle's camera as a context has it."""
     if camera is None:
         return None
@@ -133,7 +133,7 @@ def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) ->
     return Inherited(context, dict(sorted(sources.items())))
 
 
-def _fitting_camera(camera: Object, stated: Any) -> Object:
+def _fitting_camera(camera: Object, stated: object) -> Object:
     """A profile's camera without the members that the upload's camera invalidates."""
     if not isinstance(stated, Mapping):
         return camera
@@ -157,7 +157,7 @@ def _fitting_camera(camera: Object, stated: Any) -> Object:
 
 
 def _merge(
-    ours: Mapping[str, Any], stated_members: Mapping[str, Any], sources: dict[str, str], path: str = ""
+    ours: Mapping[str, object], stated_members: Mapping[str, object], sources: dict[str, str], path: str = ""
 ) -> Object:
     merged: Object = {}
     for name in [*ours, *(name for name in stated_members if name not in ours)]:
@@ -194,7 +194,7 @@ class VehicleChange:
 
     values: dict[str, Any] = field(default_factory=dict)  # of name, status and note; what is not in it stays
     # sections to replace, each as a whole; a section that is None is taken out
-    profile: dict[str, Any] = field(default_factory=dict)
+    profile: dict[str, object] = field(default_factory=dict)
     reason: str | None = None
 
 
@@ -217,7 +217,7 @@ class Vehicles:
         self,
         caller: Caller,
         name: str,
-        profile: dict[str, Any],
+        profile: dict[str, object],
         note: str | None = None,
         key: IdempotencyKey | None = None,
     ) -> tuple[VehicleDocument, bool]:
@@ -392,7 +392,12 @@ def _document(connection: sa.Connection, caller: Caller, row: VehicleRow) -> Veh
 
 
 def _changed(
-    connection: sa.Connection, caller: Caller, row: VehicleRow, changes: dict[str, Any], now: datetime, why: str | None
+    connection: sa.Connection,
+    caller: Caller,
+    row: VehicleRow,
+    changes: dict[str, object],
+    now: datetime,
+    why: str | None,
 ) -> VehicleDocument:
     changed = VEHICLES.update(
         connection, caller.agency_id, row.id, changes, version=row.version, now=now, who=caller.label, why=why
@@ -478,7 +483,7 @@ def count_upload(
 
 
 def count_driven(
-    connection: sa.Connection, agency_id: str, decode_id: str, context: DecodeContext, result: Mapping[str, Any]
+    connection: sa.Connection, agency_id: str, decode_id: str, context: DecodeContext, result: Mapping[str, object]
 ) -> None:
     """Count what a decode that is done found to have been driven, for its vehicle."""
     if context.vehicle is not None:

@@ -106,7 +106,7 @@ def missed_observations(frames: Sequence[ReadFrame], at: datetime) -> list[NewOb
     in view.
     """
     read = {marker.match.row.id for frame in frames for marker in frame.markers if marker.match and marker.match.row}
-    best: dict[str, tuple[int, dict[str, Any]]] = {}
+    best: dict[str, tuple[int, dict[str, object]]] = {}
     for frame in frames:
         for marker_id, evidence in frame.health.in_view.items():
             known = best.get(marker_id)
@@ -127,7 +127,7 @@ def unregistered_readings(frames: Sequence[ReadFrame]) -> list[NewUnregistered]:
     return [reading._replace(number=number) for number, reading in enumerate(first.values())]
 
 
-def _about(row: MarkerRow, frame: ReadFrame) -> dict[str, Any]:
+def _about(row: MarkerRow, frame: ReadFrame) -> dict[str, object]:
     return {
         "family": row.family, "place_deg": (row.lon_deg, row.lat_deg), "along": float(frame.index),
         "survey_m": _survey_m(row),
@@ -136,7 +136,7 @@ def _about(row: MarkerRow, frame: ReadFrame) -> dict[str, Any]:
 
 def _reading_evidence(
     marker: ReadMarker, frame: ReadFrame, context: DecodeContext, view: VehicleView | None, at: datetime
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Evidence of a reading of a registered marker; empty where there is none."""
     match = marker.match
     if match is None or match.row is None or match.ambiguous or match.row.status == RETIRED:
@@ -189,7 +189,7 @@ def _elsewhere(match: Match, context: DecodeContext) -> tuple[float, float] | No
     return position.lon_deg, position.lat_deg
 
 
-def _offset(pose: PlatePose, row: MarkerRow, view: VehicleView, at: datetime) -> dict[str, Any]:
+def _offset(pose: PlatePose, row: MarkerRow, view: VehicleView, at: datetime) -> dict[str, object]:
     """Where the marker was seen less where it is registered, by the vehicle's own position."""
     camera, place = view.camera, marker_at(row, decimal_year(at))
     seen = camera.camera_from_vehicle.T @ pose.translation_m + camera.position_vehicle_m

@@ -328,7 +328,7 @@ def _is_acted_on(marker: MarkerRow | None) -> bool:
     return bool(spec.get("meaning") or spec.get("speed_limit"))
 
 
-def _evidence(connection: sa.Connection, agency_id: str, suspicion: Suspicion, upload: ItemUpload) -> dict[str, Any]:
+def _evidence(connection: sa.Connection, agency_id: str, suspicion: Suspicion, upload: ItemUpload) -> dict[str, object]:
     verdict = suspicion.verdict
     uploads = [_upload(upload.decode_id, 0, upload.at, has_frames=upload.has_frames)]
     if suspicion.reading is None:
@@ -339,7 +339,7 @@ def _evidence(connection: sa.Connection, agency_id: str, suspicion: Suspicion, u
             for row in by_decode.values()
         ]
         uploads = uploads[::-1][:MAX_UPLOADS]
-    found: dict[str, Any] = {
+    found: dict[str, object] = {
         "limit": round(verdict.limit, _SHOWN_DIGITS),
         "false_alarm_probability": math.exp(-min(verdict.ratio, 700.0)),
         "month_passes": round(suspicion.month_passes, 1),
@@ -354,14 +354,14 @@ def _evidence(connection: sa.Connection, agency_id: str, suspicion: Suspicion, u
     return found
 
 
-def _upload(decode_id: str, frame: int, at: datetime, *, has_frames: bool) -> dict[str, Any]:
+def _upload(decode_id: str, frame: int, at: datetime, *, has_frames: bool) -> dict[str, object]:
     picture = f"/v1/decodes/{decode_id}/plot.svg"
     if has_frames:
         picture = f"/v1/decodes/{decode_id}/annotated.png" + (f"?frame={frame}" if frame else "")
     return {"decode_id": decode_id, "at": at.isoformat(), "picture": picture}
 
 
-def _event_detail(row: ItemRow) -> dict[str, Any]:
+def _event_detail(row: ItemRow) -> dict[str, object]:
     return {
         "what": row.what,
         "status": row.state,

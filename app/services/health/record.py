@@ -62,7 +62,7 @@ class EvidenceDocument(TypedDict, total=False):
 class FrameHealth:
     """What one frame shows of the health of markers."""
 
-    of_readings: tuple[dict[str, Any], ...] = ()  # evidence of each reading; empty where there is none
+    of_readings: tuple[dict[str, object], ...] = ()  # evidence of each reading; empty where there is none
     # evidence of markers that are in view at a readable size, whether they were read or not
     in_view: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     unregistered: tuple[NewUnregistered, ...] = ()
@@ -111,9 +111,9 @@ def _mean(values: Sequence[Sequence[float]], axis: int) -> float:
     return math.fsum(value[axis] for value in values) / len(values)
 
 
-def rounded(evidence: Mapping[str, Any]) -> dict[str, Any]:
+def rounded(evidence: Mapping[str, object]) -> dict[str, object]:
     """Evidence as it is stored: values that no figure of a sensor has are left out."""
-    kept: dict[str, Any] = {}
+    kept: dict[str, object] = {}
     for name, value in evidence.items():
         if value is None:
             continue
@@ -122,7 +122,7 @@ def rounded(evidence: Mapping[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def _rounded(value: Any, digits: int) -> Any:
+def _rounded(value: object, digits: int) -> object:
     if isinstance(value, float):
         return round(value, digits)
     if isinstance(value, tuple | list):

@@ -65,11 +65,13 @@ _ON_ROAD = frozenset({"built", "surveyed", "active", "suspect"})
 _MAX_STEP_S = 2.0  # [s] between two poses of the track, for the time near a marker
 
 
-def packet_evidence(read: ReadPackets, row: MarkerRow, kind: Disagreement | None, files: DriveFiles) -> dict[str, Any]:
+def packet_evidence(
+    read: ReadPackets, row: MarkerRow, kind: Disagreement | None, files: DriveFiles
+) -> dict[str, object]:
     """Evidence of a registered marker whose packets were authentic."""
     number = int(row.digits)
     profile = read.signal.profiles[number]
-    evidence: dict[str, Any] = {**_about(row), "along": _heard_at_s(read, number)}
+    evidence: dict[str, object] = {**_about(row), "along": _heard_at_s(read, number)}
     if kind is Disagreement.TWO_PLACES or _is_in_two_places(read, number):
         return rounded({**evidence, "two_places": True})
     if kind is Disagreement.OUT_OF_REACH:
@@ -144,7 +146,7 @@ def missed_cerpms(
     return rows
 
 
-def _about(row: MarkerRow) -> dict[str, Any]:
+def _about(row: MarkerRow) -> dict[str, object]:
     rmse_m = horizontal_rmse_m(row)
     survey_m = CERPM_SURVEY_SIGMA_M if rmse_m is None else rmse_m / math.sqrt(2)
     return {"family": row.family, "place_deg": (row.lon_deg, row.lat_deg), "survey_m": survey_m}
@@ -173,7 +175,7 @@ def _heard_at_s(read: ReadPackets, number: int) -> float:
     return float(np.median(known)) if known else 0.0
 
 
-def _quality(profile: SignalProfile) -> dict[str, Any]:
+def _quality(profile: SignalProfile) -> dict[str, object]:
     """Level above the fleet's line in standard deviations; without a fleet there is no usual level."""
     level = profile.level_db
     if level is None or profile.compared_with != "fleet":
@@ -202,7 +204,7 @@ def _expected(row: MarkerRow, track: PoseTrack | None) -> float:
 
 
 def with_evidence(
-    rows: Sequence[NewObservation], evidence: dict[str, dict[str, Any]], directions: dict[str, bool]
+    rows: Sequence[NewObservation], evidence: dict[str, dict[str, object]], directions: dict[str, bool]
 ) -> list[NewObservation]:
     """Observations with the evidence of their markers in the detail, and what it shows."""
     found = []
@@ -239,7 +241,7 @@ FAR_M = 50.0
 `MAX_BEND` allows between tags `MAX_GAP_M` apart is 41 m beside the straight line."""
 
 
-def tag_evidence(trace: ReadTrace) -> dict[str, dict[str, Any]]:
+def tag_evidence(trace: ReadTrace) -> dict[str, dict[str, object]]:
     """Evidence of the registered tags that a trace read, by marker; of one that was passed twice, of the first.
 
     A tag that was read far from its place is evidence of where it was read; one that was read at its place too is in
@@ -348,12 +350,12 @@ def _is_way_between(driven_m: float, chord_m: float) -> bool:
     return chord_m >= 1.0 and abs(driven_m - chord_m) <= MAX_BEND * chord_m + 10.0
 
 
-def _about_tag(tag: RegisteredTag) -> dict[str, Any]:
+def _about_tag(tag: RegisteredTag) -> dict[str, object]:
     survey_m = SURVEY_SIGMA_M if tag.horizontal_rmse_m is None else tag.horizontal_rmse_m / math.sqrt(2)
     return {"family": "magnet", "place_deg": (tag.lon_deg, tag.lat_deg), "survey_m": survey_m}
 
 
-def _evidence(tag: ReadTag, along: tuple[float, float] | None) -> dict[str, Any]:
+def _evidence(tag: ReadTag, along: tuple[float, float] | None) -> dict[str, object]:
     reading, registered = tag.reading, _registered(tag)
     evidence = {
         **_about_tag(registered),

@@ -152,7 +152,7 @@ class Artworks:
             file, size, len(rows), sum(is_unfit(row) for row in rows), _lowest_confidence(manifest), self.qr_code
         )
 
-    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, Any]]:
+    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, object]]:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         family = get_family(row.family)
@@ -213,7 +213,7 @@ class ArtworkJobs:
         return len(self._select(caller, selection)) > IMMEDIATE_PLATES
 
     def submit(
-        self, caller: Caller, selection: Selection, options: Mapping[str, Any], key: IdempotencyKey | None = None
+        self, caller: Caller, selection: Selection, options: Mapping[str, object], key: IdempotencyKey | None = None
     ) -> tuple[JobDocument, bool]:
         """Queue the artwork of the plates that are selected now; returns whether it was queued before.
 

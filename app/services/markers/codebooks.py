@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime, timedelta
-from typing import Any
 
 from typing_extensions import TypedDict
 
@@ -144,7 +143,7 @@ def rules_of(row: CodebookRow) -> CodebookRules:
     return CodebookRules(ReadingConditions(speed, clearance, OdometerError(**odometer)), **rules)
 
 
-def book_columns(book: Codebook) -> dict[str, Any]:
+def book_columns(book: Codebook) -> dict[str, object]:
     """Columns that keep a book."""
     document = book.to_document()
     return {name: document[name] for name in ("name", "design", "entries")}

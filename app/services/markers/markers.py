@@ -58,7 +58,7 @@ class FoundMarker(MarkerDocument, Found):
     """A marker of any family that a search found; `distance_m` is from the place of the search. [m]"""
 
 
-def _found(document: Any) -> Any:
+def _found(document: Any) -> object:
     """The shape of a family's markers in the answer to a search."""
     return types.new_class(f"Found{document.__name__}", (document, Found))
 
@@ -113,7 +113,7 @@ class MarkerChange:
     position: PositionIn | None = None
     kind: str | None = None
     reason: str | None = None
-    spec: dict[str, dict[str, Any]] = field(default_factory=dict)
+    spec: dict[str, dict[str, object]] = field(default_factory=dict)
 
 
 class Markers:
@@ -325,7 +325,7 @@ def _with_warnings(document: MarkerDocument, found: list[WarningDocument]) -> Ma
     return {**document, "position_warnings": found} if found else document
 
 
-def _spec_changes(family: Family[Any, Any], change: MarkerChange) -> dict[str, Any]:
+def _spec_changes(family: Family[Any, object], change: MarkerChange) -> dict[str, object]:
     """Members of the spec that change; InvalidParameter where they are another family's."""
     for name, members in change.spec.items():
         if name != family.name:

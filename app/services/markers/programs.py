@@ -229,7 +229,7 @@ class Layouts:
         row, family = self._get(caller, marker_id)
         return LayoutFile(family.write_sheet(row, form), form.media_type, f"{row.id}-r{row.version}.{form}")
 
-    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, Any]]:
+    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, object]]:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         family = get_family(row.family)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import pairwise
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import shapely
@@ -140,7 +140,7 @@ def area_of_text(text: str, field: str = "polygon") -> Area:
     """
     try:
         with np.errstate(invalid="ignore"):  # GEOS says so of NaN
-            shape: Any = shapely.from_wkt(text)
+            shape: object = shapely.from_wkt(text)
         document = json.loads(shapely.to_geojson(shapely.force_2d(shape)))
     except (ShapelyError, ValueError, TypeError) as error:
         raise _not_wkt(field) from error

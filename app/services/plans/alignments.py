@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, fields
 from datetime import timedelta
-from typing import Any
 
 from app.errors import InvalidParameter
 from app.formats.alignments.read import RegisteredRoad, RoadLanes, RoadStation, write_registered_road
@@ -100,7 +99,7 @@ class Alignments:
         return self._add(caller, road, {**asdict(declaration), "file_name": road.file_name, **source}, key)
 
     def _add(
-        self, caller: Caller, road: RoadFile, declared: dict[str, Any], key: IdempotencyKey | None
+        self, caller: Caller, road: RoadFile, declared: dict[str, object], key: IdempotencyKey | None
     ) -> tuple[AlignmentDocument, bool]:
         now, agency_id, name = self._clock(), caller.agency_id, road.name
         with self._database.read() as connection:
@@ -115,7 +114,7 @@ class Alignments:
                 if answer.replayed:
                     return answer.response, True
                 ALIGNMENTS.check_name(connection, agency_id, name)
-                values: dict[str, Any] = {
+                values: dict[str, object] = {
                     **first_version(now),
                     "name": name,
                     "source_key": source_key,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 from typing_extensions import TypedDict
@@ -243,7 +243,7 @@ class AlignmentDocument(RoadSummary):
 
     id: str
     name: str
-    declaration: dict[str, Any]
+    declaration: dict[str, object]
     source_sha256: str
     version: int
     created_at: datetime
@@ -366,7 +366,7 @@ class PlanPreview(PlanSummary):
 class ReadRules(TypedDict):
     """Rules of a file, as plans take them: what the file leaves out is left out."""
 
-    rules: dict[str, Any]
+    rules: dict[str, object]
 
 
 class PlanOverview(TypedDict):
@@ -397,7 +397,7 @@ class PlanDocument(PlanSummary):
     name: str
     alignment_id: str
     status: PlanStatus
-    rules: dict[str, Any]
+    rules: dict[str, object]
     proof: ProofSummary | None
     """Null if it was not proved since its markers were placed."""
     author: str
@@ -420,7 +420,7 @@ class PlanVersionDocument(TypedDict):
     at: datetime
     who: str
     why: str | None
-    plan: dict[str, Any]
+    plan: dict[str, object]
 
 
 class PlanVersionPage(TypedDict):

@@ -6,7 +6,7 @@ import hashlib
 import threading
 from collections import OrderedDict
 from datetime import timedelta
-from typing import Any, cast
+from typing import cast
 
 import orjson
 
@@ -62,7 +62,7 @@ class PlanMaking:
         return bool(row.summary["lane_length_m"] > IMMEDIATE_LANES_M)
 
     def request(
-        self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any], key: IdempotencyKey | None = None
+        self, caller: Caller, name: str, alignment_id: str, rules: dict[str, object], key: IdempotencyKey | None = None
     ) -> tuple[PlanJobDocument, bool]:
         """Queue the making of a plan; returns the job and whether the request had been made before.
 
@@ -121,7 +121,7 @@ class PlanPreviews:
         self._lock = threading.Lock()
 
     def preview(
-        self, caller: Caller, alignment_id: str, rules: dict[str, Any], *, after: int = 0, limit: int = MAX_MARKERS
+        self, caller: Caller, alignment_id: str, rules: dict[str, object], *, after: int = 0, limit: int = MAX_MARKERS
     ) -> tuple[PlanPreview, int | None]:
         """Counts, checks, costs and a page of markers of a plan by these rules, and where the next page begins.
 

@@ -66,7 +66,7 @@ class Packages:
         self._in_flight, self._ttl = in_flight, idempotency_ttl
 
     def request(
-        self, caller: Caller, plan_id: str, options: Mapping[str, Any], key: IdempotencyKey | None = None
+        self, caller: Caller, plan_id: str, options: Mapping[str, object], key: IdempotencyKey | None = None
     ) -> tuple[PlanJobDocument, bool]:
         """Queue the package of a plan as it is; returns the job and whether the request had been made before.
 

@@ -85,7 +85,7 @@ class Plans:
         caller: Caller,
         name: str,
         alignment_id: str,
-        rules: dict[str, Any],
+        rules: dict[str, object],
         key: IdempotencyKey | None = None,
         *,
         job: RunningJob | None = None,
@@ -191,7 +191,7 @@ class Plans:
         version: int | None,
         *,
         name: str | None = None,
-        rules: dict[str, Any] | None = None,
+        rules: dict[str, object] | None = None,
         reason: str | None = None,
     ) -> PlanDocument:
         """Rename a plan, or place and check it again by other rules; the proof and the approval are then gone.
@@ -338,7 +338,7 @@ class Plans:
         document = self._blobs.get(row.document_key)
         return self._processes.run(compare_plan, document, tuple(built), existing, wait_s=BUSY_WAIT_S)
 
-    def place(self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any]) -> MadePlan:
+    def place(self, caller: Caller, name: str, alignment_id: str, rules: dict[str, object]) -> MadePlan:
         """A plan with codes that no stored marker has, placed and checked; nothing is stored.
 
         Raises
@@ -403,11 +403,11 @@ def plan_overview(row: PlanRow) -> PlanOverview:
     return document_of(PlanOverview, row, **_members(row, PlanOverview), checks=checks)
 
 
-def _members(row: PlanRow, document: Any) -> dict[str, Any]:
+def _members(row: PlanRow, document: object) -> dict[str, object]:
     return {name: value for name, value in row.summary.items() if name in document.__annotations__}
 
 
-def _made_columns(caller: Caller, made: MadePlan, rules: Mapping[str, Any], document_key: str) -> dict[str, Any]:
+def _made_columns(caller: Caller, made: MadePlan, rules: Mapping[str, object], document_key: str) -> dict[str, object]:
     passed = made.summary["verdict"] != "fail"
     return {
         "status": CHECKED if passed else DRAFT,
@@ -421,7 +421,7 @@ def _made_columns(caller: Caller, made: MadePlan, rules: Mapping[str, Any], docu
     }
 
 
-def _codebook(connection: sa.Connection, caller: Caller, rules: Mapping[str, Any]) -> dict[str, Any] | None:
+def _codebook(connection: sa.Connection, caller: Caller, rules: Mapping[str, object]) -> dict[str, object] | None:
     tags = rules.get("tags")
     name = tags.get("codebook") if isinstance(tags, dict) else None
     if not isinstance(name, str):
@@ -490,7 +490,7 @@ def _commit_markers(
 
 def _parts(
     commitment: Commitment, planned: Sequence[PlannedMarker]
-) -> Iterator[tuple[Family[Any, Any], list[PlannedRow]]]:
+) -> Iterator[tuple[Family[Any, object], list[PlannedRow]]]:
     """Rows of the planned markers, family by family, as many at a time as are stored in one step."""
     for family in FAMILIES:
         own = [marker for marker in planned if marker.family == family.name]
@@ -510,7 +510,7 @@ def _columns(part: list[PlannedRow], ids: list[str], family: str, now: datetime)
         "updated_at": now,
     }
     names = sorted({name for planned in part for name in planned.columns} - {"id", "family"})
-    lists: dict[str, Sequence[Any]] = {"id": ids}
+    lists: dict[str, Sequence[object]] = {"id": ids}
     lists |= {name: [planned.columns.get(name) for planned in part] for name in names}
     return Columns.of(len(part), {name: same[name] for name in same if name not in lists}, lists)
 

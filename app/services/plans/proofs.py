@@ -106,7 +106,7 @@ class _Feeder:
     def __init__(self, processes: DecoderProcesses) -> None:
         self._processes = processes
         self._lock = threading.Lock()
-        self._running: set[Pending[Any]] = set()
+        self._running: set[Pending[object]] = set()
         self._stopped = threading.Event()
 
     def carry_out(self, task: Callable[[*ArgumentsT], ResultT], arguments: tuple[*ArgumentsT]) -> ResultT:
@@ -419,7 +419,7 @@ class Proofs:
                 if outdated:
                     return
                 proof = {"job_id": job.row.id, "at": now.isoformat(), "keys": keys, **figures}
-                changes: dict[str, Any] = {"proof": proof}
+                changes: dict[str, object] = {"proof": proof}
                 if (status := status_after(row.status, passed=figures["passed"])) != row.status:
                     changes["status"] = status
                 PLANS.update(

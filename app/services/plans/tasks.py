@@ -87,7 +87,7 @@ def road_summary(road: Alignment, format_name: str = "") -> RoadSummary:
     }
 
 
-def plan_summary(plan: Plan) -> dict[str, Any]:
+def plan_summary(plan: Plan) -> dict[str, object]:
     """What a plan has, as `PlanSummary`."""
     bill = plan_bill(plan)
     summary: PlanSummary = {
@@ -105,7 +105,7 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
     return dict(summary)
 
 
-def proof_figures(report: ProofReport, results: Sequence[UnitResult]) -> dict[str, Any]:
+def proof_figures(report: ProofReport, results: Sequence[UnitResult]) -> dict[str, object]:
     """What the plan's document shows of a proof, as `ProofFigures`."""
     figures: ProofFigures = {
         "passed": not report.wrong,
@@ -217,7 +217,7 @@ def _rounded(values: Floats, digits: int) -> list[float]:
 # === What GIS clients read of alignments and plans, made where these are computed.
 
 
-LaneFeature = tuple[dict[str, Any], list[list[float]]]
+LaneFeature = tuple[dict[str, object], list[list[float]]]
 """Properties of a lane, and its points [lon, lat]."""
 
 
@@ -269,9 +269,9 @@ def planned_columns(plan: Plan) -> Columns:
     return Columns.of(len(rows), {}, lists)
 
 
-def _row(marker: PlannedMarker, datum: str | None) -> dict[str, Any]:
+def _row(marker: PlannedMarker, datum: str | None) -> dict[str, object]:
     detail, height_m = marker.detail, marker.height_m
-    values: dict[str, Any] = {
+    values: dict[str, object] = {
         "number": marker.number,
         "family": marker.family,
         "code": marker.code,
@@ -321,7 +321,7 @@ class RoadFile:
 class SummarizedRoad:
     """A road that was read: its document, and its lanes for GIS clients."""
 
-    summary: dict[str, Any]
+    summary: dict[str, object]
     lanes: list[LaneFeature]
 
 
@@ -365,7 +365,7 @@ class MadePlan:
     """A plan that was placed and checked."""
 
     document: bytes  # as `app.planning.outputs.plan_document.write_plan` writes it, compressed by zlib
-    summary: dict[str, Any]  # what lists and the plan's page show
+    summary: dict[str, object]  # what lists and the plan's page show
     numbers: tuple[tuple[str, str], ...]  # (family, code), which no other marker may have
     features: Columns  # the markers for GIS clients
 
@@ -373,11 +373,11 @@ class MadePlan:
 @decoder_task(*_ROAD)
 def make_plan(
     road: RoadFile,
-    rules: dict[str, Any],
+    rules: dict[str, object],
     name: str,
     taken: frozenset[int] = frozenset(),
     existing: tuple[ExistingMarker, ...] = (),
-    codebook: dict[str, Any] | None = None,
+    codebook: dict[str, object] | None = None,
 ) -> MadePlan:
     """Place and check a plan.
 
@@ -445,7 +445,7 @@ def write_package_part(document: bytes, options: PackageOptions, part: PackagePa
 
 
 @decoder_task(*_PLAN)
-def write_package_manifest(document: bytes, options: PackageOptions, entries: list[dict[str, Any]]) -> bytes:
+def write_package_manifest(document: bytes, options: PackageOptions, entries: list[dict[str, object]]) -> bytes:
     """Write the manifest of a package."""
     return _package(document, options).manifest(entries)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
-from typing import Any
 
 import sqlalchemy as sa
 
@@ -54,7 +53,7 @@ MAX_NAMED = 100
 _SAME_M = 5e-5
 
 Range = tuple[float | None, float | None]
-Measured = tuple[dict[str, Any], Route]
+Measured = tuple[dict[str, object], Route]
 
 
 @dataclass(frozen=True, slots=True)
