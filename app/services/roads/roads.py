@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 
@@ -53,7 +53,7 @@ MAX_NAMED = 100
 _SAME_M = 5e-5
 
 Range = tuple[float | None, float | None]
-Measured = tuple[dict[str, object], Route]
+Measured = tuple[Mapping[str, object], Route]
 
 
 @dataclass(frozen=True, slots=True)
