@@ -140,8 +140,6 @@ class MqttIngest:
 
     Parameters
     ----------
-    source : MqttSource
-    sink : Sink
     folder : Path
         Of the spool.
     on_decode : callable, optional

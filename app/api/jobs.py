@@ -73,7 +73,6 @@ class Watch(Generic[StateT]):
     ----------
     read : callable
         States by ids; runs in a thread.
-    tick_s : float, optional
     """
 
     def __init__(self, read: Callable[[Sequence[str]], Mapping[str, StateT]], tick_s: float = TICK_S) -> None:

@@ -76,7 +76,6 @@ def find_board(grey: Grey, board: CalibrationBoard) -> BoardView:
     Parameters
     ----------
     grey : ndarray of uint8, shape (H, W)
-    board : CalibrationBoard
 
     Returns
     -------

@@ -48,11 +48,8 @@ def calibrate_camera(
 
     Parameters
     ----------
-    photos : sequence of Photo
-    board : CalibrationBoard
     coefficients : int, optional
         Of the distortion: 4, 5 or 8. Left out, k3 is kept where it is above three of its standard deviations.
-    rules : CalibrationRules, optional
 
     Raises
     ------

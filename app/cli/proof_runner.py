@@ -28,13 +28,11 @@ def run_proof(plan_file: Path, terms: ProofTerms, results_file: Path, workers: i
     ----------
     plan_file : Path
         As `write_plan` writes it.
-    terms : ProofTerms
     results_file : Path
         One JSON object a line: what is proved, then the results of units. Units that it has already, of the same plan
         and terms, are not computed again; of another plan or other terms it is replaced.
     workers : int
         Processes; 1 computes in this one.
-    progress : callable
 
     Raises
     ------

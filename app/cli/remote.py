@@ -37,11 +37,8 @@ class ResumableUpload:
 
     Parameters
     ----------
-    client : httpx.Client
-    file : Path
     context : str
         JSON.
-    shown : Progress
     check : callable
         Raises `WaymarkError` for a response that is no success.
     """

@@ -23,7 +23,6 @@ def read_declaration(schema: type[Model], declared: str, guide: str) -> Model:
 
     Parameters
     ----------
-    schema : type of BaseModel
     declared : str
         JSON.
     guide : str

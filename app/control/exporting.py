@@ -38,12 +38,7 @@ def start_tracing(settings: Settings, service: str) -> object:
 
 
 class OpenTelemetryTracer:
-    """`app.tracing.Tracer` on OpenTelemetry's SDK.
-
-    Parameters
-    ----------
-    provider : opentelemetry.sdk.trace.TracerProvider
-    """
+    """`app.tracing.Tracer` on OpenTelemetry's SDK."""
 
     def __init__(self, provider: Any) -> None:
         from opentelemetry import context, trace

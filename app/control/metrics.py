@@ -30,14 +30,7 @@ _VALID_S = 5.0
 
 
 class ProcessMetrics(Collector):
-    """What a process reports when it is asked.
-
-    Parameters
-    ----------
-    database : Database
-    pool : DecodePool
-    clock : Clock
-    """
+    """What a process reports when it is asked."""
 
     def __init__(self, database: Database, pool: DecodePool, clock: Clock) -> None:
         self._database, self._pool, self._clock = database, pool, clock
@@ -121,10 +114,8 @@ class MetricsServer:
 
     Parameters
     ----------
-    host : str
     port : int
         0: none is served.
-    metrics : ProcessMetrics
     """
 
     def __init__(self, host: str, port: int, metrics: ProcessMetrics) -> None:

@@ -33,7 +33,6 @@ class ControlServer:
     ----------
     database : Path
         The file beside which the socket is.
-    cases : OperatorCases
     """
 
     def __init__(self, database: Path, cases: OperatorCases) -> None:

@@ -215,8 +215,6 @@ def locate_fiducial(corners_px: Array, geometry: FiducialGeometry, camera: Camer
     ----------
     corners_px : ndarray, shape (4, 2)
         Clockwise from the sign's upper left. [px]
-    geometry : FiducialGeometry
-    camera : Camera
 
     Returns
     -------

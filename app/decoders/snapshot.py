@@ -256,7 +256,6 @@ def open_snapshot(data: bytes, trust: layout.Trust, now: datetime, *, newest_mad
 
     Parameters
     ----------
-    data : bytes
     trust : Trust
         The agency and its server's public keys; they come to the vehicle by another way than the snapshot.
     now : datetime

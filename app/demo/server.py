@@ -30,10 +30,6 @@ else cannot take a port before its server starts, nor while the server is starte
 def free_ports(number: int) -> list[int]:
     """Different ports of this machine that nothing listens at.
 
-    Parameters
-    ----------
-    number : int
-
     Raises
     ------
     OSError
@@ -68,7 +64,6 @@ class LocalServer:
 
     Parameters
     ----------
-    folder : Path
     host : str, optional
         Address to listen on.
     port : int, optional

@@ -18,10 +18,6 @@ _LINE_MM = 0.3
 def encode_board(board: CalibrationBoard) -> Drawing:
     """Draw a calibration board.
 
-    Parameters
-    ----------
-    board : CalibrationBoard
-
     Returns
     -------
     Drawing

@@ -37,7 +37,6 @@ def encode_message(message: CerpmMessage, key: bytes) -> bytes:
 
     Parameters
     ----------
-    message : CerpmMessage
     key : bytes
         The marker's own, 16 bytes (`derive_marker_key`).
 

@@ -155,7 +155,6 @@ class PdfFile:
 
     Parameters
     ----------
-    title : str
     compress : bool
         Deflate the streams.
     print_ready : bool

@@ -45,13 +45,11 @@ def write_snapshot(
         vertical_rmse_m, heading_rmse_deg, localization_grade; of information tags lane_lon_deg and lane_lat_deg, where
         their lane begins; of CERPMs that were received before first_sequence, last_sequence, and first_heard_s,
         last_heard_s.
-    agency_id : str
     area_deg : tuple of float
         west, south, east, north.
     made_at, expires_at : datetime
         Aware; kept to the millisecond and to the second. Readers refuse a snapshot that was made before one that they
         have already accepted.
-    key : Ed25519PrivateKey
     codebooks : sequence of mapping
         As `Codebook.to_document` writes them.
 

@@ -73,7 +73,6 @@ def read_frame_list(name: str, data: bytes, declaration: PoseDeclaration | None 
     ----------
     name : str
         Of the file; its suffix distinguishes JSON.
-    data : bytes
     declaration : PoseDeclaration, optional
         Clock, names of columns, and datum, as of a track.
 

@@ -465,7 +465,6 @@ def inspect_image(data: bytes, limits: ImageLimits | None = None, *, thermal: bo
     ----------
     data : bytes
         The upload.
-    limits : ImageLimits, optional
     thermal : bool
         Whether the frame is declared to come from a thermal camera; only those may have 16 bits.
 
@@ -494,7 +493,6 @@ def load_image(
     ----------
     data : bytes
         The upload.
-    limits : ImageLimits, optional
     thermal : bool
         Return grey instead of BGR.
     thermal_range : (float, float), optional

@@ -639,9 +639,6 @@ def read_poses(
     ----------
     name : str
         Of the file, for messages only.
-    data : bytes
-    declaration : PoseDeclaration, optional
-    limits : PoseLimits, optional
 
     Returns
     -------

@@ -85,7 +85,6 @@ def as_utf8(data: bytes, encoding: str | None = None) -> tuple[bytes, str]:
 
     Parameters
     ----------
-    data : bytes
     encoding : str, optional
         Where it is declared: a byte order mark counts more. Without it text that is not UTF-8 is UTF-16 if every
         other byte of its beginning is NUL, or else Windows-1252.
@@ -381,7 +380,6 @@ def split_rows(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
     ----------
     lines : iterable of str
         With their line ends.
-    delimiter : str
 
     Raises
     ------
@@ -433,7 +431,6 @@ def read_numbers_by_block(blocks: Iterable[bytes], columns: NumberColumns, leave
     ----------
     blocks : iterable of bytes
         The file in pieces of any size.
-    columns : NumberColumns
     leave_out : callable
         Called for each malformed row.
 
@@ -555,13 +552,7 @@ def plain_text(text: str) -> str:
 
 
 class TableWriter:
-    """Writes rows as CSV (RFC 4180), with `plain_text` for every cell that is a text. All tables are written by it.
-
-    Parameters
-    ----------
-    stream : TextIO
-    line_end : str
-    """
+    """Writes rows as CSV (RFC 4180), with `plain_text` for every cell that is a text. All tables are written by it."""
 
     def __init__(self, stream: TextIO, line_end: str = "\r\n") -> None:
         self._writer = csv.writer(stream, lineterminator=line_end)

@@ -57,8 +57,6 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
 
     Parameters
     ----------
-    file : VideoFile
-    limits : VideoLimits, optional
     rate_hz : float, optional
         Frames a second of a stream without times. [Hz]
 
@@ -290,8 +288,6 @@ def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *,
 
     Parameters
     ----------
-    index : VideoIndex
-    segment : VideoSegment
     report : ReadReport
         Filled while frames are read; complete when the first frame beyond the segment comes, or none is left.
     beyond : int

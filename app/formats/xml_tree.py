@@ -62,7 +62,6 @@ def parse_xml(data: bytes, root: str) -> ET.Element:
 
     Parameters
     ----------
-    data : bytes
     root : str
         Name of the root element that is expected.
 
@@ -99,7 +98,6 @@ def finite_number(text: str | None, name: str, place: str) -> float:
 
     Parameters
     ----------
-    text : str or None
     name, place : str
         Which number it is and where, for the error.
 

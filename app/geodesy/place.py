@@ -424,7 +424,6 @@ def positions_in_system(
         Height is NaN where unknown.
     crs : str
         Of the result, in any form of `normalize_crs`.
-    origin : Origin
 
     Raises
     ------

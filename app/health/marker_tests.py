@@ -241,7 +241,6 @@ def update_marker(
         Who passed: what one vehicle adds to a test is bounded.
     at_s : float
         When it passed. [s since 1970]
-    rules : HealthRules, optional
 
     Returns
     -------

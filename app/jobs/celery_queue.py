@@ -147,7 +147,6 @@ class CeleryQueue:
     ----------
     celery : Celery
         From `make_celery`.
-    prefix : str
     """
 
     def __init__(self, celery: Celery, prefix: str) -> None:

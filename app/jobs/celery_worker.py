@@ -49,8 +49,6 @@ class CeleryWorker:
 
     Parameters
     ----------
-    queue : CeleryQueue
-    names : sequence of QueueName
     concurrency : int
         Jobs of each queue that run at the same time: long ones of one queue hold up none of another.
     """

@@ -57,10 +57,6 @@ class Places:
 
     An agency gets a place while any is free, but more than half of them only while no other agency holds or waits for
     one. Its first two are certain, so that a server whose places are all taken by one agency still serves another.
-
-    Parameters
-    ----------
-    count : int
     """
 
     def __init__(self, count: int) -> None:
@@ -146,14 +142,12 @@ class Pending(Generic[T]):
 
     Parameters
     ----------
-    task : callable
     arguments : tuple of object
         One may be a Future that the caller has yet to set.
     interrupt : callable
         Stops the process that works on this, if one does.
     timeout_s : float
         Longest time in the process. [s]
-    agency_id : str
     is_job : bool
         Whether it is a part of a job, for which nobody waits in a request.
 
@@ -220,7 +214,6 @@ class WorkerSupervisor(threading.Thread):
         Shared with the other supervisors; they end when it is closed.
     decode : callable
         `decode_plates`, imported by name in the process.
-    limits : ProcessLimits
     """
 
     def __init__(self, tasks: FairQueue[Pending[Any]], decode: DecodePlates, limits: ProcessLimits) -> None:
@@ -445,8 +438,6 @@ class DecodePool:
     ----------
     decode : callable
         Module-level `decode_plates`; it is imported by name in each child.
-    workers : int
-    limits : ProcessLimits
     max_pixels : int
         Largest picture that OpenCV in a child decodes, in case the check of the header misses one. [px]
     max_waiting : int

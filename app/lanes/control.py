@@ -176,7 +176,6 @@ def plan_speed(
 
     Parameters
     ----------
-    path : FollowedPath
     path_enu_m : array_like, shape (S, 2)
         The points that `path` was made of.
     speed_limit_km_h : float or array_like, shape (S,)

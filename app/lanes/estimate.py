@@ -64,7 +64,6 @@ def fit_lane(
         The vehicle's own positions: give the direction of travel and the approximate shape of the lane, not its place.
     method : {'waymark', 'paper'}
         'paper' is section 2.2 of the CERPM paper: a cubic spline a side, and midpoints.
-    rules : LaneRules, optional
 
     Returns
     -------

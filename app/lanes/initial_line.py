@@ -178,7 +178,6 @@ def driven_line_from_track(track: PoseTrack, origin: tuple[float, float], marker
 
     Parameters
     ----------
-    track : PoseTrack
     origin : tuple of float
         lon_deg, lat_deg of the plane.
     markers_m : ndarray, shape (K, 2)

@@ -245,12 +245,8 @@ class LaneFit:
     ----------
     line : SmoothLine
         Near the lane's centre, in the direction of travel.
-    observations : LaneObservations
     taken : ndarray of bool, shape (M,)
         Markers that may be used.
-    drive : DrivenLine or None
-    rules : LaneRules
-    notes : Notes
 
     Attributes
     ----------

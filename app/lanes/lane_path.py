@@ -261,7 +261,6 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
     ----------
     lane : Lane
         With stations.
-    track : PoseTrack
 
     Returns
     -------

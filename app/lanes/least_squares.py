@@ -192,8 +192,6 @@ class LaneProblem:
 
     Parameters
     ----------
-    line : SmoothLine
-    measured : Measurements
     start_m, end_m : float
         Stations between which the lane is estimated. [m]
     """

@@ -110,7 +110,6 @@ def camera_from_ned(points_ned_m: npt.ArrayLike, pose: VehiclePose, camera: Came
     ----------
     points_ned_m : array_like, shape (N, 3)
         NaN where there is none. [m]
-    pose : VehiclePose
     camera : Camera
         Its mount places it on the vehicle.
 
@@ -144,8 +143,6 @@ def points_in_frame(points_ned_m: npt.ArrayLike, pose: VehiclePose, camera: Came
     ----------
     points_ned_m : array_like, shape (N, 3)
         [m]
-    pose : VehiclePose
-    camera : Camera
 
     Returns
     -------

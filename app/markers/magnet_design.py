@@ -281,7 +281,6 @@ def covariance_of(gaps_m: FloatArray, conditions: ReadingConditions) -> FloatArr
     ----------
     gaps_m : ndarray, shape (K, M - 1)
         Distances between neighbours of K tags. [m]
-    conditions : ReadingConditions
 
     Returns
     -------
@@ -368,7 +367,6 @@ def distinguishable(design: TagDesign, conditions: ReadingConditions, *, accurac
 
     Parameters
     ----------
-    design : TagDesign
     conditions : ReadingConditions
         Speed, clearance, odometer and decoder.
     accuracy : float

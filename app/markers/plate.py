@@ -707,7 +707,6 @@ def recommended_geometry(
 
     Parameters
     ----------
-    scheme : PlateScheme
     n : int, optional
         Units along a side; without, 10 for ``position-robust`` and 8 for the others.
     unit_mm : float, optional

@@ -36,7 +36,6 @@ def position_warnings(what: str, *, grade: str, transform_note: str | None, stat
         A `LocalizationGrade`.
     transform_note : str or None
         Note on the transformation of its position.
-    status : str
     """
     localization_warnings = []
     if grade == LocalizationGrade.UNFIT:

@@ -58,7 +58,6 @@ def build_alignment(
 
     Parameters
     ----------
-    file : AlignmentFile
     rules : RoadRules, optional
         Lanes to use, and widths and speeds that the file does not state.
     declaration : AlignmentDeclaration, optional

@@ -216,7 +216,6 @@ def plan_as_built(plan: Plan, surveyed: Mapping[int, SurveyedPlace]) -> Plan:
 
     Parameters
     ----------
-    plan : Plan
     surveyed : mapping of int to SurveyedPlace
         By the markers' numbers; markers that are not in it stay where they are planned.
 

@@ -169,7 +169,6 @@ def draw_trade_off(points: Sequence[TradeOffPoint], currency: str) -> str:
     ----------
     points : sequence of TradeOffPoint
         The required quality first, as `optimise_plan` returns them; at least one.
-    currency : str
 
     Returns
     -------
@@ -262,8 +261,6 @@ def draw_residuals(survey: GeoreferencedSurvey, comparison: Comparison, toleranc
 
     Parameters
     ----------
-    survey : GeoreferencedSurvey
-    comparison : Comparison
     tolerance_m : float
         Longer ones are red. [m]
     """

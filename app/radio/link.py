@@ -210,7 +210,6 @@ def fit_offset(
 
     Parameters
     ----------
-    line : PathLoss
     distance_m, rssi_dbm : ndarray, shape (P,)
         Of received packets; may be empty. [m, dBm]
     missed_m : ndarray, shape (Q,)

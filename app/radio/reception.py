@@ -100,7 +100,6 @@ def harmful_others(
         The weakest packet that is read. [dBm]
     link : LinkModel
         For its fading.
-    receiver : Receiver
 
     Returns
     -------
@@ -403,7 +402,6 @@ def read_probability(reception: Approach, speed_mps: float, air: Air) -> float:
         Down to the preview distance.
     speed_mps : float
         0.5 to 70. [m/s]
-    air : Air
 
     Raises
     ------

@@ -90,11 +90,6 @@ _EU_DENSITY_HZ = 100_000  # [Hz] source: EN 300 220-2 V3.2.1, table B.1, band L
 def check_legal(settings: RadioSettings, region: Region) -> tuple[RadioFinding, ...]:
     """Check radio settings against the rules of a region.
 
-    Parameters
-    ----------
-    settings : RadioSettings
-    region : Region
-
     Returns
     -------
     tuple of RadioFinding
@@ -105,10 +100,6 @@ def check_legal(settings: RadioSettings, region: Region) -> tuple[RadioFinding, 
 
 def check_transmitter(settings: RadioSettings) -> tuple[RadioFinding, ...]:
     """Check the duty cycle of the chip above 17 dBm, where its data sheet limits it.
-
-    Parameters
-    ----------
-    settings : RadioSettings
 
     Returns
     -------

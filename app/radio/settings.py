@@ -46,7 +46,6 @@ def time_on_air_s(
         Bits sent for four of data, 5 to 8: 5 is 4/5.
     preamble_symbols : int
         As programmed, 6 to 65,535; the radio adds 4.25.
-    crc, explicit_header : bool
     low_data_rate : bool, optional
         Low data rate optimisation; by default where a symbol lasts over 16 ms.
 

@@ -209,7 +209,6 @@ def recording(
     ----------
     connection : Connection
         Of a write transaction. Blocks do not nest.
-    author : Author
     action : str
         What was done, e.g. ``marker.registered``.
     subject : str, optional
@@ -376,7 +375,6 @@ def check_history(
     ----------
     connection : Connection
         Of a read transaction.
-    agency_id : str
     report : ChainReport
         Filled on the way.
     expected_head : tuple of int and str, optional

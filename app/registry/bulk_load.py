@@ -74,7 +74,6 @@ def json_objects(columns: Columns, *, names: Sequence[str] | None = None, option
 
     Parameters
     ----------
-    columns : Columns
     names : sequence of str, optional
         All columns in the order of the members, instead of sorted.
     optional : collection of str

@@ -102,7 +102,6 @@ def read_lines(
 
     Parameters
     ----------
-    connection, agency_id
     sources : mapping of str to LineSource
         By the name of the family.
     box : Box, optional

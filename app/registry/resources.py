@@ -101,7 +101,6 @@ class Resource(Generic[RowT]):
         ----------
         beyond : str, optional
             The id to continue after.
-        where : sequence of conditions, optional
         **equal
             Values of columns; None does not narrow.
 

@@ -214,8 +214,6 @@ class Backups:
     ----------
     database : Database
         Not opened: an SQLite file may belong to a running server, and then it is only read.
-    blobs : Blobs
-    clock : Clock
     version : str
         Of the application.
     key_files : mapping of str to Path
@@ -235,8 +233,6 @@ class Backups:
         ----------
         target : Path
             A folder that does not exist, or a file that ends in .tar.
-        options : BackupOptions
-        progress : callable, optional
 
         Raises
         ------

@@ -116,9 +116,6 @@ class UnusedBlobs:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
-    blobs : Blobs
     alone : bool
         No other process uses the database and the store, so that every blob from before this object was made belongs to
         an upload that has ended.

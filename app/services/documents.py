@@ -108,7 +108,6 @@ def kind_of_change(old_status: str, new_status: str, *, moved: bool, said: str |
 
     Parameters
     ----------
-    old_status, new_status : str
     moved : bool
         The change gives a position.
     said : str, optional

@@ -197,16 +197,7 @@ class JobHandler(Protocol):
 
 
 class Jobs:
-    """Runs queued jobs.
-
-    Parameters
-    ----------
-    database : Database
-    clock : Clock
-    handlers : mapping of JobKind to JobHandler
-    dead_letters : DeadLetters, optional
-    max_attempts : int, optional
-    """
+    """Runs queued jobs."""
 
     def __init__(
         self,

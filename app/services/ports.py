@@ -54,7 +54,6 @@ class DecoderProcesses(Protocol):
 
         Parameters
         ----------
-        task : function of a module
         arguments
             Plain values that can be pickled. A `Future` follows when the caller has set it; until the function asks
             for its result, it works on the others.

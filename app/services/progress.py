@@ -326,7 +326,6 @@ class JobFiles:
 
     Parameters
     ----------
-    database, clock, blobs
     jobs : AllJobs
         Decides which jobs a caller may see.
     """

@@ -350,7 +350,6 @@ class Reprocessings:
 
     Parameters
     ----------
-    database, clock, blobs, queue
     decodes : Decodes
         Decodes stored uploads again.
     """

@@ -138,8 +138,6 @@ class Webhooks:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     secrets : AgencySecrets
         Seals the secrets of webhooks.
     check_url : callable
@@ -303,15 +301,7 @@ class Sender(Protocol):
 
 
 class WebhookDelivery:
-    """The periodic work on webhooks; several processes of one database may do it at the same time.
-
-    Parameters
-    ----------
-    database : Database
-    clock : Clock
-    secrets : AgencySecrets
-    sender : Sender
-    """
+    """The periodic work on webhooks; several processes of one database may do it at the same time."""
 
     def __init__(self, database: Database, clock: Clock, secrets: AgencySecrets, sender: Sender) -> None:
         self._database, self._clock = database, clock

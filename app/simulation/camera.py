@@ -230,7 +230,6 @@ def expose_photo(
 
     Parameters
     ----------
-    photo, out : uint8 (H, W, C)
     share : float32 (h, w)
         Light that arrives, 0 to 1, at every fourth row and column; a single value stands for all.
     encode, sigma : float32 (L, C, 256)
@@ -354,7 +353,6 @@ def exposure_samples(count: int, exposure_s: float, lag_s: float = 0.0) -> Matri
 
     Parameters
     ----------
-    count : int
     exposure_s : float
         Light is gathered evenly over it. [s]
     lag_s : float
@@ -513,7 +511,6 @@ def render_plate_scene(scene: PlateScene, background: Image | None, rng: np.rand
 
     Parameters
     ----------
-    scene : PlateScene
     background : ndarray of uint8, shape (H, W, 3), or None
         Photo of the camera's size (blue, green, red, sRGB); None is an even grey road.
     rng : numpy.random.Generator
@@ -648,13 +645,10 @@ def gather_faces(
 
     Parameters
     ----------
-    scene : PlateScene
     members : list of int
         Faces that touch the window, with the light on each in ``lights``, shape (3,).
-    window : Window
     rays : ndarray, shape (H, W, 3, 3)
         Of the window's pixels.
-    shade : Shade
     lag_s : float
         Time constant of a slow sensor. [s]
 

@@ -58,7 +58,6 @@ def draw_stress(rng: np.random.Generator, *, night: bool = False) -> Conditions:
 
     Parameters
     ----------
-    rng : numpy.random.Generator
     night : bool
         Headlights and lit plates in place of daylight.
     """
@@ -160,7 +159,6 @@ def drive_over_plate(drive: Drive, rng: np.random.Generator, *, partly: bool = F
 
     Parameters
     ----------
-    drive : Drive
     rng : numpy.random.Generator
         Draws phase, sway and shake.
     partly : bool

@@ -105,9 +105,6 @@ def plate_face(
     ----------
     code : PlateCode
         Of the geometry's size.
-    geometry : PlateGeometry
-    look : PlateLook
-    wear : PlateWear
     rng : numpy.random.Generator
         Draws the places of patches and stains.
     texels_per_mm : float
@@ -150,7 +147,6 @@ def grid_face(cells: npt.ArrayLike, side_m: float, wear: PlateWear, rng: np.rand
         Reflectances in blue, green, red.
     side_m : float
         Outer side. [m]
-    wear : PlateWear
     rng : numpy.random.Generator
         Draws the places of patches and stains.
     led : float

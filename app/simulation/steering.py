@@ -236,12 +236,8 @@ def drive_course(course, start, errors, law, car):  # type: ignore[no-untyped-de
 
     Parameters
     ----------
-    course : Course
-    start : State
     errors : ndarray, shape (T, 3)
         Of the controller's poses: east [m], north [m], heading [rad].
-    law : Law
-    car : Car
 
     Returns
     -------
@@ -419,10 +415,8 @@ def check_steering(
     speed_limit_km_h : float or array_like, shape (S,)
         Driven at except in bends, which are driven at 2 m/s2 of lateral acceleration, with 1.5 m/s2 of braking before
         them. [km/h]
-    controller : Controller or str
     settings : SteeringSettings, optional
         Gains, and the vehicle's delays as assumed by the controller.
-    vehicle : Vehicle, optional
     noise : PoseNoise, optional
         Errors of the poses for the controller; none by default.
     truth_enu_m : array_like, shape (M, 2), optional

@@ -211,7 +211,6 @@ class Blobs:
         ----------
         key : str
             From `new_blob_key`.
-        data : bytes
 
         Raises
         ------
@@ -233,7 +232,6 @@ class Blobs:
         ----------
         key : str
             From `new_blob_key`, and not used before: unlike `put`, this cannot refuse a taken one.
-        path : Path
 
         Raises
         ------

@@ -96,7 +96,6 @@ def check_url(url: str, *, loopback: bool = False) -> SplitResult:
 
     Parameters
     ----------
-    url : str
     loopback : bool, optional
         Also http, and any name.
 
@@ -174,7 +173,6 @@ class WebhookSender:
         Loopback addresses and http are allowed: for trying out on one machine.
     tls : SSLContext, optional
         The system's authorities by default.
-    total_s : float, optional
     """
 
     def __init__(

@@ -292,10 +292,8 @@ def check_single_position(
 
     Parameters
     ----------
-    position : SinglePosition
     lon_deg, lat_deg : ndarray, shape (M,)
         Registered markers around it. [deg]
-    is_known : callable
     """
     if position.first == 0 or position.second == 0:
         yield zero_coordinate(None)

@@ -126,7 +126,6 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
     ----------
     given : TrackInput
         In any order.
-    rules : TrackRules, optional
 
     Returns
     -------

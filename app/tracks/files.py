@@ -40,8 +40,6 @@ def write_geojson(track: Track, name: str, others: Sequence[dict[str, Any]] = ()
 
     Parameters
     ----------
-    track : Track
-    name : str
     others : sequence of dict
         Markers that gave no fix: features without a geometry.
     """

@@ -399,8 +399,6 @@ def filter_track(step_s, start, start_cov, around, m, motion):  # type: ignore[n
     start_cov : ndarray, shape (n, n)
     around : ndarray, shape (N, n)
         Where the model is linearised; NaN: at the filter's own state.
-    m : Measurements
-    motion : Motion
     """
     count, n = around.shape
     first_pass = math.isnan(around[0, 0])

@@ -297,7 +297,6 @@ def passage_distances(
 
     Parameters
     ----------
-    fixes : FixArrays
     used : ndarray of bool, shape (K,)
     square : ndarray, shape (K,)
         With each fix left out alone.

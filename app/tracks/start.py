@@ -106,7 +106,6 @@ def consistent_chain(
         In the order of time. [m]
     sigma_m, time_s, node, clock, clock_sigma_s : ndarray, shape (K,)
         Larger standard deviation of each [m], its time [s] and node, the number and the error of its clock [s].
-    driven : DeadReckoning
 
     Returns
     -------

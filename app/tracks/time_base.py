@@ -44,7 +44,6 @@ def split_where_time_falls(
 
     Parameters
     ----------
-    fixes : tuple of PositionFix
     segment_of : ndarray of int, shape (K,)
     segments : list of Segment
         Those of new parts are appended.

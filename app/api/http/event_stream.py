@@ -92,7 +92,6 @@ class EventStream(Response):
     ----------
     events : async iterator of ServerEvent
         Yields a heartbeat at least each `HEARTBEAT_S`.
-    places : StreamPlaces
     key_id : str
         Whose stream it is.
     max_s : float, optional

@@ -172,7 +172,6 @@ class Slots:
 
     Parameters
     ----------
-    in_all, per_agency : int
     wait_s : float
         Longest wait for a place. [s]
     """

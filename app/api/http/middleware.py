@@ -143,7 +143,6 @@ class Guarded:
 
     Parameters
     ----------
-    app : ASGIApp
     authenticate : callable
         The caller behind a key; runs in a thread.
     recall : callable

@@ -178,7 +178,6 @@ def problem_responses(*statuses: int, refused: type[Problem] | None = None) -> D
 
     Parameters
     ----------
-    statuses : int
     refused : type, optional
         The problem document with a report that the route may return with status 422.
     """

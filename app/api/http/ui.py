@@ -99,7 +99,6 @@ class CompressedFiles(StaticFiles):
 
     Parameters
     ----------
-    directory : Path
     headers : mapping
         Headers of every response.
     others : mapping
@@ -168,7 +167,6 @@ class GuideFiles(StaticFiles):
 
     Parameters
     ----------
-    folder : Path
     headers : mapping
         Headers of every response. The style sheets of its theme contain icons as data, which the policy must allow.
     """
@@ -265,7 +263,6 @@ def mount_static(
 
     Parameters
     ----------
-    app : FastAPI
     hosts : tuple of str
         Origins of other hosts that the pages may ask: a configured base map and identity provider.
     base_map : Path, optional

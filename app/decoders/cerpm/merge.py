@@ -39,7 +39,6 @@ def vehicle_positions(track: PoseTrack, time_s: npt.ArrayLike, max_gap_s: float 
 
     Parameters
     ----------
-    track : PoseTrack
     time_s : array_like, shape (N,)
         NaN where it is not known. [s]
     max_gap_s : float
@@ -210,7 +209,6 @@ def merge_markers(
         Registered markers by number.
     track : PoseTrack, optional
         The vehicle's own positions.
-    rules : MergeRules, optional
 
     Returns
     -------
@@ -521,15 +519,11 @@ def match_known_markers(
 
     Parameters
     ----------
-    packets : sequence of ReceivedPacket
     keys : callable or mapping
         As of `verify_packets`.
-    known : KnownCerpms
-    track : PoseTrack, optional
     freshness : FreshnessRules, optional
         Its `min_interval_s` is replaced by half of the shortest programmed interval of these markers, if known: their
         clocks may be inaccurate.
-    rules : MergeRules, optional
     max_invalid_tags : int
         As of `verify_packets`.
     """

@@ -148,7 +148,6 @@ def profile_signals(
         Longitude and latitude of markers by number. [deg]
     track : PoseTrack or None
         The vehicle's own positions; without them only delivery is known.
-    rules : SignalRules, optional
 
     Returns
     -------

@@ -411,7 +411,6 @@ def verify_packets(
         The key of the marker of a number; None, or no entry, where there is no such marker.
     earlier_spans : mapping of int to sequence of SequenceSpan, optional
         Spans of earlier logs, by number; logs may be uploaded in any order.
-    rules : FreshnessRules, optional
     max_invalid_tags : int
         Payloads after this many different ones with an invalid tag are not checked: tags of 32 bits can be guessed if
         somebody may guess often enough.

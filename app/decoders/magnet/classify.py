@@ -331,7 +331,6 @@ def magnet_features(dipole: Dipole, around: Sequence[Dipole], state: MagnetState
 
     Parameters
     ----------
-    dipole : Dipole
     around : sequence of Dipole
         Those near it, itself included, with their own log odds.
     state : MagnetState

@@ -531,12 +531,10 @@ def fit_dipoles(data: FitData, start: Floats, kinds: Integers, prior: MagnetPrio
 
     Parameters
     ----------
-    data : FitData
     start : ndarray, shape (n, 6)
         If the last one has no moment, moments are first solved for with the places as they are.
     kinds : ndarray of int, shape (n,)
         `UPRIGHT` or `FORWARD`.
-    prior : MagnetPrior
     """
     n = start.shape[0]
     dipoles = start.copy()

@@ -170,8 +170,6 @@ def decode_trace_metro(
     ----------
     trace : MagnetTrace
         Whole; it must begin without a magnet for some 50 zero crossings of the noise.
-    bar : MagnetometerBar
-    settings : MetroSettings, optional
     """
     settings = settings or MetroSettings()
     if len(trace.t_s) < 60 or not trace.speed_t_s.size:

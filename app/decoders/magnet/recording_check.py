@@ -97,7 +97,6 @@ def find_mistakes(
     ----------
     trace : MagnetTrace
         As it was declared.
-    bar : MagnetometerBar
     findings : sequence of Finding
         What was read in it.
     candidates : TagCandidates, optional

@@ -65,7 +65,6 @@ def likely_codeword(probabilities: Array, n: int, scheme: PlateScheme) -> Likely
         Of the symbols of each cell, all above 0; each row sums to 1.
     n : int
         Units along a side.
-    scheme : PlateScheme
 
     Returns
     -------
@@ -143,7 +142,6 @@ def _list_words(scores: Floats, words: _Listing, best: Symbols, top: float, tota
     Parameters
     ----------
     scores : ndarray, shape (length, 16)
-    words : _Listing
     best : ndarray of uint8, shape (length,)
         The best word so far.
     top, total : float
@@ -280,7 +278,6 @@ def decode_symbols(
 
     Parameters
     ----------
-    evidence : UnitEvidence
     n : int
         Units along a side.
     codebook : sequence of PlateCode

@@ -286,7 +286,6 @@ def _find_runs(level: _Level, words: Words, marks: Marks, high: Signal, runs: Ru
 
     Parameters
     ----------
-    level : _Level
     words, marks : ndarray of uint64 and of int8
         One memory for the marks of a row, all zero: those beyond the frame stay so.
     high : ndarray of int16, shape (blocks,)

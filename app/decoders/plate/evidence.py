@@ -96,7 +96,6 @@ def read_evidence(
     ----------
     reading : PlateReading
         Where the plate is.
-    evidence : PlateEvidence
     codebook : sequence of PlateCode
         Codes of the plates registered nearby.
     verify : callable, optional

@@ -106,8 +106,6 @@ def candidate_features(signal: MarkerSignal, quads: Sequence[MarkerQuad], geomet
     ----------
     signal : MarkerSignal
         In which they were found.
-    quads : sequence of MarkerQuad, length Q
-    geometry : PlateGeometry
     """
     planes = signal.planes
     view = _View(signal.opponent, planes.blue, planes.green, planes.red, planes.luma, signal.scale)

@@ -295,11 +295,8 @@ def minimize(patch: PlatePatch, model: PlateModel, equations: NormalEquations, s
 
     Parameters
     ----------
-    patch : PlatePatch
-    model : PlateModel
     equations : NormalEquations
         Memory for the normal equations; holds those of the last step afterwards.
-    stage : Stage
 
     Returns
     -------
@@ -445,7 +442,6 @@ def fit_plate(
         Blue, green, red, of which the luma counts; or grey levels.
     centroids_px : ndarray, shape (4, 2)
         Triangle and squares, clockwise. [px]
-    geometry : PlateGeometry
     linear : bool
         The levels are proportional to what is seen, as a thermal camera's; else they are gamma encoded.
 
@@ -507,7 +503,6 @@ def refine_corners(image: npt.NDArray[Any], fit: PlateFit, geometry: PlateGeomet
         That was fitted.
     fit : PlateFit
         Its model stays as it is.
-    geometry : PlateGeometry
 
     Returns
     -------

@@ -462,10 +462,6 @@ def set_unit_likelihoods(
 
     Parameters
     ----------
-    pixels : PlatePixels
-    pattern : PlatePattern
-    light : LightPrior
-    spots : Spots
     likelihoods : ndarray, shape (units, 5)
         Set to those of the unit as in the pattern, flipped, the same two under a smooth stain, and flipped under a spot
         of paint, on average over the spots.

@@ -91,7 +91,6 @@ def fit_light(pixels: PlatePixels, white: Array, parts: Array, albedo: Array, si
 
     Parameters
     ----------
-    pixels : PlatePixels
     white : ndarray, shape (P,)
         Share of the white units in each pixel.
     parts : ndarray, shape (P, parts)

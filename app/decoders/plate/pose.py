@@ -108,8 +108,6 @@ def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeomet
         Clockwise from the triangle's. [px]
     covariance_px2 : ndarray, shape (8, 8)
         Of the flattened corners. [px2]
-    geometry : PlateGeometry
-    camera : Camera
 
     Returns
     -------
@@ -223,7 +221,6 @@ def fix_vehicle(
     ----------
     pose : PlatePose
         As seen by the camera.
-    camera : Camera
     lon_deg, lat_deg, height_m : float
         Surveyed centre of the plate. [deg, m]
     heading_deg : float

@@ -379,8 +379,6 @@ def set_pixel_shares(patch: PlatePatch, model: PlateModel, max_nodes: int, share
 
     Parameters
     ----------
-    patch : PlatePatch
-    model : PlateModel
     max_nodes : int
         Quadrature nodes on each side of the middle at most.
     shares : ndarray, shape (h, w, shapes)

@@ -428,7 +428,6 @@ def verify_units(
         The frame.
     fit : PlateFit
         Of the plate in it.
-    geometry : PlateGeometry
     dark : ndarray of bool, shape (units,)
         The pattern, in the order of the symbols' units.
     units : UnitEvidence

@@ -148,7 +148,6 @@ class PlateTracker:
         ----------
         time_s : float
             Of the frame. [s]
-        seen : sequence of SeenPlate
         speed_m_s : float, optional
             Of the vehicle, where it is known. [m/s]
         """
@@ -255,8 +254,6 @@ class PlateVideoSearch:
     ----------
     camera : Camera, optional
         Without it, evidence of several frames does not add up.
-    codebook : sequence of PlateCode
-    geometries : sequence of PlateGeometry
     thermal : bool
         Then every frame is decoded: there are no colours to search for.
 
@@ -294,7 +291,6 @@ class PlateVideoSearch:
 
         Parameters
         ----------
-        number : int
         time_s : float
             Of the frame. [s]
         half, full : callable

@@ -56,7 +56,6 @@ def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookR
         May be empty.
     meanings : sequence of Meaning
         New ones.
-    rules : CodebookRules
 
     Returns
     -------
@@ -108,8 +107,6 @@ def fitting_codes(design: TagDesign, rules: CodebookRules, *, max_count: int) ->
 
     Parameters
     ----------
-    design : TagDesign
-    rules : CodebookRules
     max_count : int
         Codes at most.
 

@@ -97,13 +97,10 @@ def place_tag(
     ----------
     lane : LaneLine
         The lane's centre line, in the direction of legal travel.
-    tag : InformationTag
     chainage_m : float
         Of the first magnet. [m]
-    name : str
     offset_m : float
         Of the whole tag from the line, left positive. [m]
-    meaning : Meaning, optional
 
     Raises
     ------
@@ -141,8 +138,6 @@ def place_line(
     ----------
     line : LaneLine
         The painted line.
-    style : LineStyle
-    name : str
     from_m, to_m : float
         Chainages of the first and the last magnet; to the end of the line without. [m]
     spacing_m : float

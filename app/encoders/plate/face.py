@@ -497,7 +497,6 @@ def encode_plate(order: PlateOrder, options: ArtworkOptions = PLAIN) -> Drawing:
 
     Parameters
     ----------
-    order : PlateOrder
     options : ArtworkOptions
         Heaters and light sources under the face.
 
@@ -526,10 +525,8 @@ def encode_sheets(
 
     Parameters
     ----------
-    orders : sequence of PlateOrder
     width_mm, height_mm : float
         The sheet, at most 5000. [mm]
-    options : ArtworkOptions
 
     Raises
     ------

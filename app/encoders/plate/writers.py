@@ -65,7 +65,6 @@ def paint(
     ----------
     image : ndarray of uint8, shape (H, W, 3), BGR
         Painted in place.
-    drawing : Drawing
     layers : iterable of Layer
         Bottom to top.
     px_per_mm : float
@@ -142,7 +141,6 @@ def write_png(drawing: Drawing, *, dpi: float = 150.0) -> bytes:
 
     Parameters
     ----------
-    drawing : Drawing
     dpi : float
         Resolution, 36 to 1200; the sheet may not exceed 64 million pixels. [1/inch]
 
@@ -194,10 +192,6 @@ _ORDER = (*UNDER_LAYERS, *FACE_LAYERS, *SHEET_LAYERS)
 
 def write_svg(drawing: Drawing) -> bytes:
     """Write a drawing as SVG 1.1.
-
-    Parameters
-    ----------
-    drawing : Drawing
 
     Returns
     -------
@@ -284,7 +278,6 @@ def write_pdf(drawings: Drawing | Sequence[Drawing], *, compress: bool = True) -
 
     Parameters
     ----------
-    drawings : Drawing or sequence of Drawing
     compress : bool
         Deflate the pages; leave it out where an archive compresses the file again.
 
@@ -449,10 +442,6 @@ _STAMPS = re.compile(r"^(\d+\.\d+[^ \n]*) @ \d{4}-\d\d-\d\dT[^\n]*$", re.MULTILI
 def write_dxf(drawing: Drawing) -> bytes:
     """Write a drawing as DXF R2010.
 
-    Parameters
-    ----------
-    drawing : Drawing
-
     Returns
     -------
     bytes
@@ -562,8 +551,6 @@ def write_artwork(drawing: Drawing, form: ArtworkFormat, *, dpi: float = DEFAULT
 
     Parameters
     ----------
-    drawing : Drawing
-    form : ArtworkFormat
     dpi : float
         For PNG. [1/inch]
     compress : bool

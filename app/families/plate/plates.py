@@ -264,7 +264,6 @@ def coded_plate(
 
     Parameters
     ----------
-    wanted : CodeInput
     n : int
         Units along a side.
     place_deg : (float, float) or None

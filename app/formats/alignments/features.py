@@ -407,7 +407,6 @@ def assemble_road(
 
     Parameters
     ----------
-    format_name : str
     features : sequence of RoadFeature
         At least one line.
     defaults : mapping, optional

@@ -71,10 +71,6 @@ def read_landxml(data: bytes) -> AlignmentFile:
     Ends of elements are trusted, their directions (dir, dirStart) are not. Geometry and profile are in true distance;
     station equations only change what is displayed. Equations and start station are those of the first alignment.
 
-    Parameters
-    ----------
-    data : bytes
-
     Returns
     -------
     AlignmentFile

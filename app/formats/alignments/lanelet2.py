@@ -238,10 +238,6 @@ def read_lanelet2(data: bytes) -> AlignmentFile:
     Ways are turned where they are stored against the lanelet. Lanelets without a subtype, and those for pedestrians or
     bicycles alone, are left out. Two-way lanelets become lanes in their own direction alone.
 
-    Parameters
-    ----------
-    data : bytes
-
     Returns
     -------
     AlignmentFile

@@ -375,7 +375,6 @@ def read_alignment(data: bytes, name: str = "", *, format: str | None = None) ->
 
     Parameters
     ----------
-    data : bytes
     name : str
         Of the file, for messages.
     format : str, optional

@@ -17,7 +17,6 @@ class SqliteBag:
 
     Parameters
     ----------
-    file : SpooledFile
     max_bytes : int
         Largest message. [byte]
 

@@ -141,9 +141,6 @@ def read_packets(
     ----------
     name : str
         Of the file, for messages only.
-    data : bytes
-    declaration : PacketDeclaration, optional
-    limits : PacketLimits, optional
 
     Returns
     -------

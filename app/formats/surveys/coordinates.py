@@ -97,7 +97,6 @@ def without_zone(easting: Floats, system: CRS) -> tuple[Floats, int | None]:
     ----------
     easting : ndarray, shape (N,)
         In the unit of the CRS.
-    system : CRS
 
     Raises
     ------
@@ -194,7 +193,6 @@ def check_second_pair(read: Coordinates, crs: str, factor: float) -> Iterator[Fa
 
     Parameters
     ----------
-    read : Coordinates
     crs : str
         Of the eastings and northings.
     factor : float

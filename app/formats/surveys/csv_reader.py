@@ -66,7 +66,6 @@ def find_header(
         Cells of the first rows, at least one.
     comments : sequence of sequences of str
         Cells of the first comments, which may hold the header.
-    declaration : ImportDeclaration
 
     Raises
     ------

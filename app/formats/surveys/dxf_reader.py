@@ -34,7 +34,6 @@ def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceT
 
     Parameters
     ----------
-    data : bytes
     layer : str, optional
         Only entities on it.
     unit : str, optional

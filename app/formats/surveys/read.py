@@ -279,8 +279,6 @@ def read_survey(data: bytes, declaration: ImportDeclaration, code_form: CodeForm
 
     Parameters
     ----------
-    data : bytes
-    declaration : ImportDeclaration
     code_form : CodeForm, optional
         What codes of the family look like: a column that is only named like one has to show it.
 

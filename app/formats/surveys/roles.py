@@ -86,8 +86,6 @@ def find_roles(source: SourceTable, declaration: ImportDeclaration, code_form: C
 
     Parameters
     ----------
-    source : SourceTable
-    declaration : ImportDeclaration
     code_form : CodeForm, optional
         Without it any text is a code.
 

@@ -326,10 +326,8 @@ def read_numbers(cells: Any, field: str, *, form: NumberForm = PLAIN, required: 
 
     Parameters
     ----------
-    cells : sequence of str, float or None, Texts, or ndarray
     field : str
         Name of the column in faults.
-    form : NumberForm
     required : bool
         An empty cell is a fault.
     """

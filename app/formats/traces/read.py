@@ -163,7 +163,6 @@ def read_trace(
         Files by name; ZIP archives stand for the files within.
     declaration : TraceDeclaration, optional
         Needed for plain CSV, Parquet and CAN logs.
-    limits : TraceLimits, optional
 
     Returns
     -------

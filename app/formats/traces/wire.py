@@ -43,13 +43,10 @@ class StreamReader:
 
     Parameters
     ----------
-    data : bytes
     name : str
         Of the file.
-    sensors : int
     rate_hz : float or None
         Expected sample rate, if it is known. [Hz]
-    limits : TraceLimits
     report : TraceReport
         Gets gaps and losses.
     """

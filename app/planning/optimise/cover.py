@@ -161,7 +161,6 @@ def cheapest_cover(
         Not decreasing. [m]
     cost, gain : ndarray, shape (N,)
         Not negative.
-    need : float
     window_m, length_m : float
         [m]
 
@@ -316,7 +315,6 @@ def fewest_pairs(
 
     Parameters
     ----------
-    lane : Lane
     max_error_m : float
         Of the path, as `path_error_m` computes it. [m]
     max_spacing_m : float

@@ -146,7 +146,6 @@ def optimise_plan(
 
     Parameters
     ----------
-    alignment : Alignment
     rules : PlanRules
         With `quality`. Decision points and events keep their markers; their cost is included, and they count as fixes.
     models : sequence of FamilyModel

@@ -286,7 +286,6 @@ def write_report(plan: Plan, missing_files: Mapping[str, str] | None = None) -> 
 
     Parameters
     ----------
-    plan : Plan
     missing_files : mapping of str to str, optional
         Files that cannot be written of this plan, with the reason.
     """

@@ -107,7 +107,6 @@ def map_of_road(road: Alignment, markers: Sequence[MapMarker], *, within_m: floa
 
     Parameters
     ----------
-    road : Alignment
     markers : sequence of MapMarker
         Grade and crossfall are those of the road.
     within_m : float

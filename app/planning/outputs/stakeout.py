@@ -88,7 +88,6 @@ def plan_stakeout(plan: Plan, crs: str | None = None, unit: str | None = None) -
 
     Parameters
     ----------
-    plan : Plan
     crs : str, optional
         A projected system; without, that of the road, or the UTM zone of WGS 84 that it lies in.
     unit : str, optional

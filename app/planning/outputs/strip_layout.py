@@ -141,7 +141,6 @@ def cut_strips(plan: Plan, scale: int | None = None) -> tuple[Strip, ...]:
 
     Parameters
     ----------
-    plan : Plan
     scale : int, optional
         Denominator, one of `SCALES`; without, the largest scale of not too many sheets.
 

@@ -70,7 +70,6 @@ class Drawings:
     ----------
     plan : Plan
         With markers.
-    options : DrawingOptions, optional
 
     Raises
     ------

@@ -156,7 +156,6 @@ def path_error_m(lane: Lane, chainages_m: Floats, shifts_m: Floats | None = None
 
     Parameters
     ----------
-    lane : Lane
     chainages_m : ndarray, shape (K,)
         Of all markers. [m]
     shifts_m : ndarray, shape (K,), optional
@@ -262,9 +261,6 @@ def place_plan(
 
     Parameters
     ----------
-    alignment : Alignment
-    rules : PlanRules
-    name : str
     codebook : Codebook, optional
         Of the agency, whose codes stay; a new one without.
     numbers : NumberSource, optional

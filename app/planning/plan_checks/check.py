@@ -330,7 +330,6 @@ def check_plan(plan: Plan, existing: Sequence[ExistingMarker] = ()) -> Plan:
 
     Parameters
     ----------
-    plan : Plan
     existing : sequence of ExistingMarker
         Markers of the registry near the road.
     """

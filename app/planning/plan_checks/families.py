@@ -390,8 +390,6 @@ def readable_zone_m(camera: Camera, geometry: PlateGeometry, left_m: float = 0.0
 
     Parameters
     ----------
-    camera : Camera
-    geometry : PlateGeometry
     left_m : float
         Plate's centre left of the camera. [m]
     grade_change : float

@@ -104,8 +104,6 @@ def predict_print(
         Of the plate's face, relative to its white; blue, green, red.
     code : PlateCode
         What the registry has.
-    geometry : PlateGeometry
-    design : DesignSpeed
     seed : int
         Draws light, sensor and noise. The same seed gives the same prediction.
     """
@@ -154,8 +152,6 @@ def read_passes(
         Of a plate; a margin around it may be part of the face.
     code : PlateCode
         What the registry has.
-    geometry : PlateGeometry
-    design : DesignSpeed
     seed, passes : int
         Each pass draws light, sensor and noise of its own.
     """
@@ -271,8 +267,6 @@ def render_view(
     ----------
     code : PlateCode
         Of the geometry's size.
-    geometry : PlateGeometry
-    rules : CameraRules
     speed_mps : float
         [m/s]
     ahead_m, left_m : float

@@ -410,8 +410,6 @@ def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_mps: float, l
 
     Parameters
     ----------
-    geometry : PlateGeometry
-    rules : CameraRules
     speed_mps : float
         Above 0. [m/s]
     left_m : float

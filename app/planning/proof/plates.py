@@ -205,7 +205,6 @@ def read_frames(one: PlatePass, *, enough: int | None = None, most: int | None =
 
     Parameters
     ----------
-    one : PlatePass
     enough : int, optional
         Stop when so many frames were read: the nearest is rendered first, the others in an even spread. A frame is
         the same whether others were rendered before it or not.

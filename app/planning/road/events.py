@@ -35,13 +35,10 @@ def find_events(
 
     Parameters
     ----------
-    file : AlignmentFile
     geometries : sequence of LaneGeometry
         That the lanes were made of.
-    lanes : sequence of Lane
     places_deg : ndarray, shape (N, 2)
         Longitude and latitude of the file's events.
-    rules : RoadRules
     warnings : list of str
         Gets a sentence for each event that lies on no lane.
 
@@ -68,7 +65,6 @@ def find_curves(lane: Lane, radius_m: float, turn_deg: float) -> list[RoadEvent]
 
     Parameters
     ----------
-    lane : Lane
     radius_m : float
         [m]
     turn_deg : float

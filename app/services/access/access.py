@@ -196,8 +196,6 @@ class Access:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     verify : callable, optional
         Who a token speaks for, where an issuer's tokens are taken.
     """

@@ -129,7 +129,6 @@ def log_change(
     ----------
     connection : Connection
         Of the transaction that makes the change.
-    caller : Caller
     action, subject : str
         What was done, and the id or name of what it was done to.
     document : mapping, optional
@@ -186,7 +185,6 @@ class AuditLog:
 
         Parameters
         ----------
-        agency : str, optional
         expected_head : tuple of int and str, optional
             Number and hash of an entry that the log must contain.
         verified_heads : mapping of str to (int, str), optional

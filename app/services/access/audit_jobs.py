@@ -71,7 +71,6 @@ class AuditVerifications:
 
     Parameters
     ----------
-    database, clock, queue
     idempotency_ttl : timedelta
         How long the response to an Idempotency-Key is stored.
     """

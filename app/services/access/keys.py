@@ -46,8 +46,6 @@ class Keys:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     access : Access
         Knows which keys were just used.
     """
@@ -197,11 +195,8 @@ class Agencies:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     secrets : AgencySecrets
         Encrypts the text of a first key, which a repeated request is answered with.
-    idempotency_ttl : timedelta
     """
 
     def __init__(self, database: Database, clock: Clock, secrets: AgencySecrets, idempotency_ttl: timedelta) -> None:
@@ -219,10 +214,8 @@ class Agencies:
         ----------
         caller : Caller
             An operator.
-        name : str
         label : str
             What histories call the holder of the admin key.
-        key : IdempotencyKey, optional
 
         Returns
         -------

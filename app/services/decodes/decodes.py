@@ -44,8 +44,6 @@ class Decodes:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     blobs : Blobs
         Where uploads are stored.
     quotas : Quotas
@@ -54,7 +52,6 @@ class Decodes:
         Where uploads wait that take too long for an immediate response.
     handlers : sequence of UploadHandler
         The first one that accepts an upload decodes it.
-    rules : DecodeRules, optional
     """
 
     def __init__(
@@ -228,11 +225,8 @@ class DecodeDetails:
 
     Parameters
     ----------
-    database : Database
     blobs : Blobs
         Where uploads are stored.
-    processes : DecoderProcesses
-    rules : DecodeRules, optional
     """
 
     def __init__(

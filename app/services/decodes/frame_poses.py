@@ -131,13 +131,7 @@ class GapDocument(TypedDict):
 
 
 class FramePlaces:
-    """Times and places of the frames of one drive.
-
-    Parameters
-    ----------
-    context : DecodeContext
-    lists : FrameLists
-    """
+    """Times and places of the frames of one drive."""
 
     def __init__(self, context: DecodeContext, lists: FrameLists | None = None) -> None:
         self._context, self._terms = context, frame_terms(context.frames or {})
@@ -172,7 +166,6 @@ class FramePlaces:
         ----------
         ordinal : int
             Number of the frame among the frames of the drive, from 0.
-        name : str
         taken : str, optional
             Its EXIF's time.
         """

@@ -475,8 +475,6 @@ class PendingRun:
 
     Parameters
     ----------
-    processes : DecoderProcesses
-    frames : list of ArchiveFrame
     wait_s : float
         How long to wait for a place. [s]
 

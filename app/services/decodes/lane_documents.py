@@ -136,7 +136,6 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
 
     Parameters
     ----------
-    lane : Lane
     grade : str
         Whether positions may be used to localize a vehicle.
     """

@@ -228,7 +228,6 @@ def marker_at(row: MarkerRow, epoch: float) -> MarkerRow:
 
     Parameters
     ----------
-    row : MarkerRow
     epoch : float
         [decimal year]
     """

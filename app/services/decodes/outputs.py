@@ -181,11 +181,8 @@ class DecodeOutputs:
 
     Parameters
     ----------
-    database : Database
     blobs : Blobs
         Where uploads and plots are stored.
-    processes : DecoderProcesses
-    rules : DecodeRules, optional
     """
 
     def __init__(

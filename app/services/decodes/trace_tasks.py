@@ -83,7 +83,6 @@ def decode_recording(
         Texts of the information tags that are registered nearby.
     formats : tuple of TagFormat
         Used where there are none.
-    limits : TraceLimits
     """
     from app.decoders.magnet.recording_check import find_mistakes
 

@@ -167,15 +167,12 @@ class UploadPath:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     blobs : Blobs
         Where uploads and plots are stored.
     quotas : Quotas
         Of keys and agencies.
     queue : JobQueue
         Where uploads wait that take too long for an immediate response.
-    idempotency_ttl : timedelta
     """
 
     def __init__(

@@ -80,7 +80,6 @@ def collect(rows: Sequence[tuple[DecodeClock, DecodeRow]], *, use_unfit: bool) -
 
     Parameters
     ----------
-    rows : sequence of (DecodeClock, DecodeRow)
     use_unfit : bool
         Use positions that are not for localization, too.
 

@@ -49,13 +49,7 @@ class NewDrive:
 
 
 class Drives:
-    """Use cases on drives.
-
-    Parameters
-    ----------
-    database, clock, blobs, processes, queue
-    idempotency_ttl : timedelta
-    """
+    """Use cases on drives."""
 
     def __init__(
         self, database: Database, clock: Clock, blobs: Blobs, processes: DecoderProcesses, queue: JobQueue,

@@ -38,12 +38,8 @@ class Calibrations:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
-    processes : DecoderProcesses
     images : ImageLimits
         Of each photo.
-    idempotency_ttl : timedelta
     """
 
     def __init__(

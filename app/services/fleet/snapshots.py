@@ -39,8 +39,6 @@ class Snapshots:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     signing_keys : callable
         The server's keys, of which the first signs; called for every snapshot, so that a rotation needs no restart.
     """

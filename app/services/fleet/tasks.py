@@ -40,12 +40,10 @@ def calibrate_photos(
     ----------
     photos : tuple of (str, SpooledFile)
         Names and contents; a ZIP stands for the photos in it.
-    board : CalibrationBoard
     coefficients : int or None
         Of the distortion.
     limits : ImageLimits
         Of each photo.
-    archives : ArchiveLimits
 
     Raises
     ------

@@ -105,7 +105,6 @@ def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) ->
 
     Parameters
     ----------
-    profile : mapping
     stated : mapping
         Only what the upload states; a member that is None is unknown and is not inherited.
     kind : str
@@ -199,14 +198,7 @@ class VehicleChange:
 
 
 class Vehicles:
-    """Use cases on vehicles, one transaction each.
-
-    Parameters
-    ----------
-    database : Database
-    clock : Clock
-    idempotency_ttl : timedelta
-    """
+    """Use cases on vehicles, one transaction each."""
 
     def __init__(self, database: Database, clock: Clock, idempotency_ttl: timedelta = timedelta(hours=24)) -> None:
         self._database = database

@@ -397,8 +397,6 @@ class Maintenance:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     markers : Markers
         Changes the status of a marker, with its history and the audit log.
     """

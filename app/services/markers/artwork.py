@@ -71,7 +71,6 @@ class Artworks:
 
     Parameters
     ----------
-    database : Database
     public_url : str
         Start of the addresses of public pages, which go into the QR codes; empty: there are no QR codes.
     read : callable
@@ -191,13 +190,10 @@ class ArtworkJobs:
 
     Parameters
     ----------
-    database, clock, processes, queue
-    files : JobFiles
     public_url : str
         Start of the addresses of public pages, which go into the QR codes; empty: there are no QR codes.
     in_flight : int
         Plates that are drawn at the same time.
-    idempotency_ttl : timedelta
     """
 
     def __init__(

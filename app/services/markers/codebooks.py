@@ -222,14 +222,7 @@ MeaningInput = tuple[str, float | str]
 
 
 class Codebooks:
-    """Use cases on codebooks. Codes are worked out before a transaction begins: that can take a second.
-
-    Parameters
-    ----------
-    database : Database
-    clock : Clock
-    idempotency_ttl : timedelta
-    """
+    """Use cases on codebooks. Codes are worked out before a transaction begins: that can take a second."""
 
     def __init__(self, database: Database, clock: Clock, idempotency_ttl: timedelta = timedelta(hours=24)) -> None:
         self._database = database

@@ -121,9 +121,6 @@ class Markers:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
-    rules : MarkerRules
     random_bits : callable, optional
         Source of the numbers that plates get.
     """

@@ -260,7 +260,6 @@ class PlateDrafts:
 
     Parameters
     ----------
-    processes : DecoderProcesses
     read : callable
         Decoder of the self-proof.
     crs_accuracy_m : float

@@ -31,7 +31,6 @@ def plate_for(
     ----------
     position : (float, float) or None
         Longitude, latitude. [deg]
-    registry_number : int or None
     scheme : str
         Of positions.
     check_digits : int, optional

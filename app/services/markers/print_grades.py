@@ -34,15 +34,7 @@ class PrintDeclaration:
 
 
 class PrintGrades:
-    """Use case on print grades.
-
-    Parameters
-    ----------
-    database : Database
-    clock : Clock
-    processes : DecoderProcesses
-    images : ImageLimits, optional
-    """
+    """Use case on print grades."""
 
     def __init__(
         self, database: Database, clock: Clock, processes: DecoderProcesses, images: ImageLimits | None = None

@@ -72,14 +72,7 @@ class PayloadDocument(TypedDict):
 
 
 class CerpmPrograms:
-    """Use cases on what CERPMs are programmed with.
-
-    Parameters
-    ----------
-    database : Database
-    clock : Clock
-    secrets : AgencySecrets
-    """
+    """Use cases on what CERPMs are programmed with."""
 
     def __init__(self, database: Database, clock: Clock, secrets: AgencySecrets) -> None:
         self._database = database

@@ -306,7 +306,6 @@ class Searches:
 
         Parameters
         ----------
-        line : sequence of (lon_deg, lat_deg)
         corridor_m : float
             Width of the corridor. [m]
         after : (distance_m, id), optional

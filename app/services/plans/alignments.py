@@ -38,10 +38,8 @@ class Alignments:
 
     Parameters
     ----------
-    database, clock, blobs, processes
     accuracy_m : float
         Worst stated accuracy of a transformation that is used. [m]
-    idempotency_ttl : timedelta
     """
 
     def __init__(

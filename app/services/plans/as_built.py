@@ -24,7 +24,6 @@ def compare_as_built(plan: Plan, built: Sequence[BuiltRow], existing: Sequence[E
 
     Parameters
     ----------
-    plan : Plan
     built : sequence of BuiltRow
         The markers that the plan became.
     existing : sequence of ExistingMarker

@@ -37,10 +37,8 @@ class PlanMaking:
 
     Parameters
     ----------
-    database, clock, queue
     plans : Plans
         Does the work.
-    idempotency_ttl : timedelta
     """
 
     def __init__(
@@ -110,7 +108,6 @@ class PlanPreviews:
 
     Parameters
     ----------
-    plans : Plans
     making : PlanMaking
         Decides which roads are too long.
     """
@@ -127,9 +124,6 @@ class PlanPreviews:
 
         Parameters
         ----------
-        caller : Caller
-        alignment_id : str
-        rules : dict
         after : int, optional
             Markers of the pages before. The first page is always computed; the pages after it are those of the
             last preview with the same rules, as long as this process keeps it.

@@ -51,10 +51,8 @@ class Packages:
 
     Parameters
     ----------
-    database, clock, blobs, processes, queue
     in_flight : int
         Parts of one package that are written at the same time; as many are in memory.
-    idempotency_ttl : timedelta
     """
 
     def __init__(
@@ -72,11 +70,8 @@ class Packages:
 
         Parameters
         ----------
-        caller : Caller
-        plan_id : str
         options : mapping
             See `package_options`.
-        key : IdempotencyKey, optional
 
         Raises
         ------

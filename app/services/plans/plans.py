@@ -69,7 +69,6 @@ class Plans:
 
     Parameters
     ----------
-    database, clock, blobs, processes
     rules : MarkerRules
         Of the markers that plans become.
     """
@@ -94,10 +93,6 @@ class Plans:
 
         Parameters
         ----------
-        caller : Caller
-        name, alignment_id : str
-        rules : dict
-        key : IdempotencyKey, optional
         job : RunningJob, optional
             That makes it; it is finished in the same transaction.
 

@@ -55,8 +55,6 @@ def results_as_done(
 
     Parameters
     ----------
-    processes : DecoderProcesses
-    task : callable
     arguments : mapping of key to tuple
         The task is carried out with each of them.
     in_flight : int
@@ -294,10 +292,8 @@ class Proofs:
 
     Parameters
     ----------
-    database, clock, blobs, processes, queue
     in_flight : int
         Units of one proof that are driven at the same time.
-    idempotency_ttl : timedelta
     """
 
     def __init__(

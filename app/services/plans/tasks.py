@@ -383,9 +383,6 @@ def make_plan(
 
     Parameters
     ----------
-    road : RoadFile
-    rules : dict
-    name : str
     taken : frozenset of int
         Registry numbers that other markers have.
     existing : tuple of ExistingMarker

@@ -56,7 +56,6 @@ class FormTokens:
     ----------
     secret : callable
         The server's master key, from which the key of tokens is derived; asked for at the first use.
-    clock : Clock
     """
 
     def __init__(self, secret: Callable[[], bytes], clock: Clock) -> None:
@@ -227,13 +226,7 @@ class PublicMarker(NamedTuple):
 
 
 class PublicPages:
-    """Use cases on public pages.
-
-    Parameters
-    ----------
-    database : Database
-    clock : Clock
-    """
+    """Use cases on public pages."""
 
     def __init__(self, database: Database, clock: Clock) -> None:
         self._database, self._clock = database, clock

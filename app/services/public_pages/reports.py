@@ -64,7 +64,6 @@ class DamageReports:
 
     Parameters
     ----------
-    database, clock, blobs, processes, quotas
     images : ImageLimits
         Of photos.
     contact_days : int

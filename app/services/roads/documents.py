@@ -275,7 +275,6 @@ def references_of(
 
     Parameters
     ----------
-    positions : sequence of (lon_deg, lat_deg)
     before_m : sequence of float or None
         Their previous measures, which distinguish ambiguous feet. [m]
     old : Route, optional

@@ -88,11 +88,8 @@ class Roads:
 
     Parameters
     ----------
-    database : Database
-    clock : Clock
     crs_accuracy_m : float
         Worst stated accuracy of a transformation that is used. [m]
-    idempotency_ttl : timedelta
     """
 
     def __init__(

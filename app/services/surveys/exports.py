@@ -56,7 +56,6 @@ class Exports:
 
     Parameters
     ----------
-    database : Database
     write : callable
         Writes a file of a kind of `WHOLE`, here or in another process.
     """
@@ -169,11 +168,8 @@ class ExportJobs:
 
     Parameters
     ----------
-    database, clock, queue
     exports : Exports
         Writes the files.
-    files : JobFiles
-    idempotency_ttl : timedelta
     """
 
     def __init__(
@@ -190,10 +186,8 @@ class ExportJobs:
 
         Parameters
         ----------
-        caller : Caller
         wanted : mapping
             ``format`` and what `filter_of` reads.
-        key : IdempotencyKey or None
         """
         filter_of(wanted)
         now, agency_id = self._clock(), caller.agency_id

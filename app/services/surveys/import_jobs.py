@@ -49,8 +49,6 @@ class ImportJobs:
 
     Parameters
     ----------
-    database, clock, blobs, queue
-    idempotency_ttl : timedelta
     imports : Imports
         Does the work.
     """
@@ -69,11 +67,8 @@ class ImportJobs:
 
         Parameters
         ----------
-        caller : Caller
         declared : mapping
             See `import_input`.
-        file : SpooledFile
-        key : IdempotencyKey or None
 
         Returns
         -------

@@ -92,7 +92,6 @@ class Imports:
 
         Parameters
         ----------
-        caller, given, key
         step : callable, optional
             Called with `READ` when the file was read, and with `SETTLED` before anything is stored, outside of any
             transaction; what it raises stops the import.

@@ -94,13 +94,7 @@ class QuotaRules:
 
 
 class Quotas:
-    """Checks of quotas.
-
-    Parameters
-    ----------
-    database : Database
-    rules : QuotaRules
-    """
+    """Checks of quotas."""
 
     def __init__(self, database: Database, rules: QuotaRules) -> None:
         self._database, self._rules = database, rules

@@ -70,13 +70,10 @@ class Uploads:
 
     Parameters
     ----------
-    database, clock, blobs, spool
     s3 : S3Parts
         Where parts are sent that do not pass the server.
     decodes : Decodes
         Takes the complete file.
-    quotas : Quotas
-    rules : UploadRules, optional
     """
 
     def __init__(

@@ -241,7 +241,6 @@ def simulate_drive(scene: Scene, rng: np.random.Generator) -> SimulatedDrive:
 
     Parameters
     ----------
-    scene : Scene
     rng : numpy.random.Generator
         Draws placement, motion, sensors and noise.
     """

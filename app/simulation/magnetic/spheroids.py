@@ -72,7 +72,6 @@ def spheroid_moment_am2(spheroid: Spheroid, earth_ut: Floats) -> Floats:
 
     Parameters
     ----------
-    spheroid : Spheroid
     earth_ut : ndarray, shape (3,)
         The earth's field along, left and up. [uT]
 
@@ -95,7 +94,6 @@ def spheroid_dipoles(spheroid: Spheroid, earth_ut: Floats, *, nodes: int | None 
 
     Parameters
     ----------
-    spheroid : Spheroid
     earth_ut : ndarray, shape (3,)
         The earth's field along, left and up. [uT]
     nodes : int, optional
@@ -141,7 +139,6 @@ def spheroid_clutter(thing: Clutter, road: Road, rng: np.random.Generator, *, ea
 
     Parameters
     ----------
-    thing : Clutter
     road : Road
         Its direction at the object turns the earth's field.
     rng : numpy.random.Generator

@@ -24,8 +24,6 @@ def move_claim(
 
     Parameters
     ----------
-    lane : TrueLane
-    markers : InstalledMarkers
     row : int
         Index of the marker.
     rng : numpy.random.Generator
@@ -121,7 +119,6 @@ def forge_packets(
     ----------
     packets : sequence of ReceivedPacket
         With payloads; each forgery starts from one of them.
-    count : int
     rng : numpy.random.Generator
         Draws which, and how: another tag by chance; the tag of the packet kept and its place, its sequence or another
         bit of its body changed; the tag of another packet; a tag of zeros; the number of another marker.

@@ -125,8 +125,6 @@ def drive_lane(lane: TrueLane, driver: Driver, rng: np.random.Generator, *, star
 
     Parameters
     ----------
-    lane : TrueLane
-    driver : Driver
     rng : numpy.random.Generator
         Draws speed, wander, habit and how bends are cut.
     start_s : float
@@ -166,9 +164,6 @@ def observe_track(lane: TrueLane, drive: Drive, receiver: SatelliteReceiver, rng
 
     Parameters
     ----------
-    lane : TrueLane
-    drive : Drive
-    receiver : SatelliteReceiver
     rng : numpy.random.Generator
         Draws its errors, its jitter and which fixes are missing.
     """
@@ -197,10 +192,8 @@ def draw_multipath_m(multipath: Multipath, time_s: Floats, rng: np.random.Genera
 
     Parameters
     ----------
-    multipath : Multipath
     time_s : ndarray, shape (T,)
         Rising, nearly evenly; T is 2 or more. [s]
-    rng : numpy.random.Generator
 
     Notes
     -----
@@ -313,15 +306,12 @@ def drive_past(
 
     Parameters
     ----------
-    lane : TrueLane
     markers : InstalledMarkers
         Those that send.
     rng : numpy.random.Generator
         Draws the drive, the receiver's errors and the radio.
     sign : callable or None
         Message to the bytes that its marker sends; None for the paper's packets in clear.
-    radio : Radio, optional
-    driver : Driver, optional
     receiver : SatelliteReceiver, optional
         RTK by default.
     drive : Drive, optional

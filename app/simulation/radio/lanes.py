@@ -258,7 +258,6 @@ def install_markers(
 
     Parameters
     ----------
-    lane : TrueLane
     places : sequence of MarkerPlace
         In the lane's local frame, as `app.planning.cerpm_placement.place_markers` gives them.
     rng : numpy.random.Generator

@@ -235,7 +235,6 @@ def send_beacons(
     ----------
     count : int
         Markers.
-    radio : Radio
     start_s, end_s : float
         [s]
     rng : numpy.random.Generator
@@ -268,8 +267,6 @@ def draw_shadows_db(sender: Ints, travelled_m: Floats, radio: Radio, rng: np.ran
         By time.
     travelled_m : ndarray, shape (K,)
         Distance driven by the vehicle. [m]
-    radio : Radio
-    rng : numpy.random.Generator
     """
     drawn = rng.normal(0, 1, len(sender))
     shadows = np.empty(len(sender))

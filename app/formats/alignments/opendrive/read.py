@@ -231,10 +231,6 @@ def read_opendrive(data: bytes) -> AlignmentFile:
     is named by its road and lane number. Sections are joined where the file links them; roads are not. The stations are
     distances along the road's reference line. header/offset is applied only where the geoReference is usable.
 
-    Parameters
-    ----------
-    data : bytes
-
     Returns
     -------
     AlignmentFile

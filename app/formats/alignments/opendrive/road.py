@@ -393,11 +393,8 @@ def build_tracks(road: Road, grid: Grid, names: set[str], road_name: str) -> lis
 
     Parameters
     ----------
-    road : Road
-    grid : Grid
     names : set of str
         Names that are taken; those of the lanes are added.
-    road_name : str
     """
     parts = _lane_parts(road, grid)
     prefix = f"junction {road.junction} {road.place}" if road.junction is not None else road.place
