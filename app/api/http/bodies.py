@@ -142,9 +142,8 @@ class _SpoolingParser(MultiPartParser):
 
     def __init__(self, request: Request, *, max_files: int, max_fields: int, max_part_size: int) -> None:
         super().__init__(
-            request.headers, request.stream(),
-            max_files=max_files, max_fields=max_fields, max_part_size=max_part_size,
-        )  # fmt: skip
+            request.headers, request.stream(), max_files=max_files, max_fields=max_fields, max_part_size=max_part_size
+        )
         self._spool = spool_of(request)
         self._parts: list[SpooledPart] = []
 

@@ -178,8 +178,9 @@ class PackageIn(_Body):
     ] = None
     title_block: TitleBlockIn = TitleBlockIn()
     formats: Annotated[list[ArtworkFormat], Field(min_length=1, max_length=4, description="Of each plate.")] = [
-        ArtworkFormat.PDF, ArtworkFormat.SVG,
-    ]  # fmt: skip
+        ArtworkFormat.PDF,
+        ArtworkFormat.SVG,
+    ]
     heaters: Annotated[Flag, Field(description="Heating tracks under dark units.")] = False
     leds: Annotated[Flag, Field(description="Light sources under light units.")] = False
 

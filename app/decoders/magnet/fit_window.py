@@ -207,7 +207,7 @@ class FitWindow:
                 fitted.dipoles[i], fitted.covariance[i], fitted.explained[i], misfit[i], fitted.prior_cost[i], kind, 0.0
             )
             for i, kind in enumerate(kinds)
-        ]  # fmt: skip
+        ]
 
     def _whitened(self, start_m: float, end_m: float, height_m: float, others: list[Dipole]) -> FitData | None:
         """The blocks between two odometers, less the fields of others, for fits at a height; None if too few."""

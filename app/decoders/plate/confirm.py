@@ -159,10 +159,11 @@ def _is_contradicted(sightings: _Sightings, frames: Sequence[tuple[int, Sequence
     codes = (one.code or one.likely_code for frame in others for one in frames[frame][1])
     digits = sightings.code.digits
     return any(
-        code is not None and len(code.digits) == len(digits)
+        code is not None
+        and len(code.digits) == len(digits)
         and sum(a != b for a, b in zip(code.digits, digits, strict=True)) <= CLOSE_CELLS
         for code in codes
-    )  # fmt: skip
+    )
 
 
 def _joint_error(readings: Sequence[PlateReading]) -> float | None:

@@ -343,7 +343,7 @@ def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> De
             corrected = tuple(int(i) for i in np.flatnonzero(changed))
             return DecodedSymbols(
                 code, REGISTERED_CONFIDENCE, _floats(shown), corrected, from_codebook=True, confirmed=True
-            )  # fmt: skip
+            )
     return None
 
 

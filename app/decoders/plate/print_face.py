@@ -85,8 +85,9 @@ def rectify_face(image: npt.NDArray[np.uint8], image_from_face: Array, geometry:
         light = np.asarray(cv2.resize(light, (wide, tall), interpolation=cv2.INTER_AREA), np.float32)
     scale = np.array([wide / part.shape[1], tall / part.shape[0]])
     # pixel centres are at integers in the photo, in its part, and in the face
-    shift = np.array([[scale[0], 0, (0.5 - low[0]) * scale[0] - 0.5], [0, scale[1], (0.5 - low[1]) * scale[1] - 0.5],
-                      [0, 0, 1]])  # fmt: skip
+    shift = np.array(
+        [[scale[0], 0, (0.5 - low[0]) * scale[0] - 0.5], [0, scale[1], (0.5 - low[1]) * scale[1] - 0.5], [0, 0, 1]]
+    )
     face_from_px = np.array([[1 / PX_PER_MM, 0, 0.5 / PX_PER_MM], [0, 1 / PX_PER_MM, 0.5 / PX_PER_MM], [0, 0, 1]])
     warp = shift @ image_from_face @ face_from_px
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

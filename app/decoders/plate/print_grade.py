@@ -101,16 +101,18 @@ def _graded(
 def _contrast(evidence: PrintEvidence) -> PrintParameter:
     dark = evidence.face.dark_level
     return _graded(
-        PrintParameterName.SYMBOL_CONTRAST, 100 * (1 - dark),
+        PrintParameterName.SYMBOL_CONTRAST,
+        100 * (1 - dark),
         f"dark units reflect {dark:.0%} of what the white ones reflect",
         "use a matt black paint or a denser ink; make sure that nothing glossy mirrors the sky",
-    )  # fmt: skip
+    )
 
 
 def _modulation(evidence: PrintEvidence) -> PrintParameter:
     values = np.abs(reflectance_margins(evidence.face, evidence.code))
-    return _by_unit(evidence, PrintParameterName.MODULATION, values,
-                    "cover every unit evenly, and replace faded or stained ones")  # fmt: skip
+    return _by_unit(
+        evidence, PrintParameterName.MODULATION, values, "cover every unit evenly, and replace faded or stained ones"
+    )
 
 
 def _margin(evidence: PrintEvidence) -> PrintParameter:
@@ -296,10 +298,11 @@ def _unused(evidence: PrintEvidence) -> PrintParameter:
     code, face = evidence.code, evidence.face
     differs = (face.dark != code.units.astype(bool)).ravel()[unit_index(code.n)].any(axis=1)
     return _graded(
-        PrintParameterName.UNUSED_ERROR_CORRECTION, _unused_share(code, differs),
+        PrintParameterName.UNUSED_ERROR_CORRECTION,
+        _unused_share(code, differs),
         f"{int(differs.sum())} of {len(differs)} cells have a wrong unit, which error correction must make good",
         "print the wrong units again: what is wrong when new is not left for dirt",
-    )  # fmt: skip
+    )
 
 
 def _decode(evidence: PrintEvidence) -> PrintParameter:
@@ -407,9 +410,7 @@ def grade_print(
 # --- the plate --------------------------------------------------------------------------------------------------------
 
 
-def _find_plate(
-    photo: Image, code: PlateCode | None, geometry: PlateGeometry | None
-) -> tuple[PlateReading, bool]:  # fmt: skip
+def _find_plate(photo: Image, code: PlateCode | None, geometry: PlateGeometry | None) -> tuple[PlateReading, bool]:
     """The plate's reading without a registry, its corners in the photo, and whether a registry with the code helps."""
     shrink = min(1.0, SEARCH_SIDE_PX / max(photo.shape[:2]))
     small = photo
@@ -461,10 +462,11 @@ def _no_plate(small: Image, found: list[PlateReading]) -> PrintNotGraded:
         )  # fmt: skip
     if found:
         return PrintNotGraded(
-            f"a plate was found but not read: {found[0].reason or found[0].outcome}", field="code",
+            f"a plate was found but not read: {found[0].reason or found[0].outcome}",
+            field="code",
             limit="a plate that can be read, or its digits",
             cure="declare the code that the plate should have, then a plate that cannot be read is graded too",
-        )  # fmt: skip
+        )
     return PrintNotGraded(
         "no plate was found in the photo", field="photo", limit="one whole plate of the declared geometry",
         cure="photograph the whole plate from above, in even light and in focus, and check n, unit_mm and gap_mm; "
@@ -488,8 +490,9 @@ def _check_agreement(reading: PlateReading, expected: PlateCode, face: MeasuredF
         raise PrintNotGraded(
             f"the plate cannot be read, and only {agreement:.0%} of its units are as expected",
             field="code",
-            limit=f"{MIN_AGREEMENT:.0%} of the units", cure="photograph the plate that is declared, in even light",
-        )  # fmt: skip
+            limit=f"{MIN_AGREEMENT:.0%} of the units",
+            cure="photograph the plate that is declared, in even light",
+        )
 
 
 # --- the photo --------------------------------------------------------------------------------------------------------
@@ -512,10 +515,11 @@ def _check_size(photo: Image, corners_px: Array, geometry: PlateGeometry) -> Non
 def _check_light(face: MeasuredFace) -> None:
     if face.clipped > MAX_CLIPPED:
         raise PrintNotGraded(
-            f"{face.clipped:.0%} of the white is over-exposed", field="photo",
+            f"{face.clipped:.0%} of the white is over-exposed",
+            field="photo",
             limit=f"at most {MAX_CLIPPED:.0%} of the white's pixels at {CLIPPED_LEVEL} of 255 or more",
             cure="expose less: tap on the plate's white before taking the photo, and avoid direct sun and flash",
-        )  # fmt: skip
+        )
     if face.white_level < MIN_WHITE_LEVEL:
         raise PrintNotGraded(
             f"the photo is too dark: the plate's white has the level {face.white_level:.0f} of 255", field="photo",
@@ -526,10 +530,11 @@ def _check_light(face: MeasuredFace) -> None:
     if face.light_ratio > MAX_LIGHT_RATIO or shaded > MAX_SHADED:
         raise PrintNotGraded(
             f"the light on the plate is uneven: it varies by the factor {face.light_ratio:.1f}, "
-            f"and {shaded:.0%} of the light units are darker than the others", field="photo",
+            f"and {shaded:.0%} of the light units are darker than the others",
+            field="photo",
             limit=f"a factor of {MAX_LIGHT_RATIO:g}, {MAX_SHADED:.0%} of the light units",
             cure="photograph in the open shade or under an overcast sky, without a shadow's edge on the plate",
-        )  # fmt: skip
+        )
 
 
 def _view(photo: Image, face: MeasuredFace, geometry: PlateGeometry, focal_35mm: float | None) -> PrintView:
@@ -546,18 +551,20 @@ def _check_view(view: PrintView, geometry: PlateGeometry) -> None:
     limit_mm = MAX_EDGE_GAPS * geometry.gap_mm
     if not view.edge_mm <= limit_mm:
         raise PrintNotGraded(
-            f"the photo is blurred: edges are {view.edge_mm:.1f} mm wide", field="photo",
+            f"the photo is blurred: edges are {view.edge_mm:.1f} mm wide",
+            field="photo",
             limit=f"at most {limit_mm:.1f} mm from 10 to 90 %, {MAX_EDGE_GAPS:g} of a gap",
             cure="hold the camera still, focus on the plate, and come nearer; if every photo shows it, the ink bleeds",
-        )  # fmt: skip
+        )
     limit_deg = MAX_TILT_DEG if view.focal_known else MAX_TILT_ASSUMED_DEG
     if view.tilt_deg > limit_deg:
         known = "" if view.focal_known else " (30 degrees with the focal length in the photo's EXIF)"
         raise PrintNotGraded(
             f"the photo is oblique: the camera is tilted by {view.tilt_deg:.0f} degrees against the plate",
-            field="photo", limit=f"at most {limit_deg:g} degrees{known}",
+            field="photo",
+            limit=f"at most {limit_deg:g} degrees{known}",
             cure="hold the camera parallel to the plate, straight above its centre, and send the photo uncropped",
-        )  # fmt: skip
+        )
 
 
 def _axes(

@@ -212,7 +212,7 @@ def position_warnings(row: MarkerRow, what: str) -> list[str]:
     """What makes the position of a plate or a tag unfit for localization."""
     return reading.position_warnings(
         what, grade=row.localization_grade, transform_note=row.transform_note, status=row.status
-    )  # fmt: skip
+    )
 
 
 def horizontal_rmse_m(row: MarkerRow) -> float | None:

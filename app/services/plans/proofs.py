@@ -421,10 +421,7 @@ class Proofs:
                 PLANS.update(
                     connection, agency_id, plan_id, changes, version=row.version, now=now, who=caller.label, why="proof"
                 )
-                log_change(
-                    connection, caller, "plan.proved", now=now, subject=plan_id, document=figures,
-                    status=status,
-                )  # fmt: skip
+                log_change(connection, caller, "plan.proved", now=now, subject=plan_id, document=figures, status=status)
             stage.keep()
         delete_unused(self._blobs, files_of(row.proof))
 
