@@ -201,7 +201,7 @@ def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -
             database, clock, blobs, pool, accuracy_m=settings.crs_accuracy_m, idempotency_ttl=ttl
         ),
         packages=packages,
-        plan_jobs=PlanJobs(database, clock),
+        plan_jobs=PlanJobs(database),
         plan_making=plan_making,
         plan_previews=PlanPreviews(plans, plan_making),
         plans=plans,

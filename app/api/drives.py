@@ -174,15 +174,6 @@ def get_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-@router.post("/{drive_id}/cancel", UPLOADERS, responses=document_response(TrackedDriveDocument, 404))
-def cancel_drive(drive_id: DriveId, caller: Caller, drives: Drives) -> Response:
-    """Cancel a drive.
-
-    A finished one stays as it is.
-    """
-    return json_response(drives.cancel(caller, drive_id))
-
-
 @router.delete(
     "/{drive_id}", UPLOADERS, status_code=204, responses=problem_responses(404, 409), response_class=Response
 )

@@ -270,19 +270,12 @@ class AllJobs:
         Conflict
             It is too late: what it makes is being stored.
         """
+        with self._database.read() as connection:  # the one who stores may have the writer for long
+            _check_cancel(caller, _visible(connection, caller, job_id))
         with self._database.write() as connection:
             job = _visible(connection, caller, job_id)
-            if not may_cancel(caller, job):
-                raise NotAllowed(
-                    f"a key with the scope {caller.scope} may not cancel this job",
-                    limit="the key that asked for it, or " + " or ".join(sorted(rules_of(job.kind).cancellers)),
-                )
+            _check_cancel(caller, job)
             limit = rules_of(job.kind).too_late_progress
-            if job.state in UNFINISHED and job.progress >= limit:
-                raise Conflict(
-                    f"the {job.kind} is storing already", field="job_id", limit="jobs that store nothing yet",
-                    cure="read its result",
-                )  # fmt: skip
             registry_jobs.request_cancel(connection, caller.agency_id, job_id, self.clock(), below_progress=limit)
             return job_document(_visible(connection, caller, job_id), self.clock())
 
@@ -290,6 +283,22 @@ class AllJobs:
         """Jobs by their ids, without inputs and results; whoever follows one was checked before."""
         with across_agencies(), self._database.read() as connection:
             return {row.id: row for row in registry_jobs.list_progress(connection, job_ids)}
+
+
+def _check_cancel(caller: Caller, job: JobRow) -> None:
+    """Refuse to cancel a job of another, or one whose result is being stored."""
+    if not may_cancel(caller, job):
+        raise NotAllowed(
+            f"a key with the scope {caller.scope} may not cancel this job",
+            limit="the key that asked for it, or " + " or ".join(sorted(rules_of(job.kind).cancellers)),
+        )
+    if job.state in UNFINISHED and job.progress >= rules_of(job.kind).too_late_progress:
+        raise Conflict(
+            f"the {job.kind} is storing already",
+            field="job_id",
+            limit="jobs that store nothing yet",
+            cure="read its result",
+        )
 
 
 def _visible(connection: sa.Connection, caller: Caller, job_id: str) -> JobRow:

@@ -89,7 +89,7 @@ def test_a_running_job_is_cancelled(client: httpx.Client) -> None:
     members = {f"{k}.png": slow if k == 1 else good for k in range(20)}
     location = post_frame(client, pack(members), name="drive.zip").headers["Location"]
     wait_until(lambda: client.get(location).json()["state"] == "running", "the job to run")
-    assert client.post(f"{location}/cancel").status_code == 200
+    assert client.post(f"/v1/jobs/{location.rpartition('/')[2]}/cancel").status_code == 200
     assert finished(client, location)["state"] == "cancelled"
 
 

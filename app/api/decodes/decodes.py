@@ -119,15 +119,6 @@ def get_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Respons
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-@router.post("/{decode_id}/cancel", UPLOADERS, responses=document_response(DecodeDocument, 404))
-def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
-    """Cancel a decode.
-
-    A finished one stays as it is.
-    """
-    return json_response(decodes.cancel(caller, decode_id))
-
-
 @router.get(
     "/{decode_id}/plot.svg",
     EVERYBODY,

@@ -155,15 +155,6 @@ def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-@job_router.post("/{job_id}/cancel", PLANNERS, responses=document_response(PlanJobDocument, 404))
-def cancel_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
-    """Cancel a job about a plan.
-
-    A finished one stays as it is.
-    """
-    return json_response(jobs.cancel(caller, job_id))
-
-
 # === /v1/plans.
 
 

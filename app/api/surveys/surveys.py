@@ -170,17 +170,6 @@ def get_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
     return json_response(jobs.get(caller, import_id))
 
 
-@import_router.post("/{import_id}/cancel", SURVEYORS, responses=document_response(ImportJobDocument, 404, 409))
-def cancel_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
-    """Cancel an import.
-
-    A queued one never starts, a running one stops before it stores anything.
-
-    409 where it is too late: it is storing already, or finished.
-    """
-    return json_response(jobs.cancel(caller, import_id))
-
-
 def _refused(request: Request, report: ImportReport) -> Response:
     first = report["faults"][0]
     place = f"row {first['row']}: " if first["row"] is not None else ""

@@ -14,7 +14,6 @@ from app.errors import InvalidParameter, NotFound, WaymarkError
 from app.formats.format import SpooledFile
 from app.markers.cerpm import MESSAGE_BYTES
 from app.registry import decodes as store
-from app.registry import jobs
 from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.decodes import DecodeFilter, DecodeRow
@@ -163,14 +162,6 @@ class Decodes:
             )
         page = [decode_head(row) for row in rows[:limit]]
         return page, page[-1]["id"] if len(rows) > limit else None
-
-    def cancel(self, caller: Caller, decode_id: str) -> DecodeDocument:
-        """Ask the job of a decode to stop; a finished one stays as it is."""
-        own = caller.own_key_id
-        with self._database.write() as connection:
-            store.get_decode(connection, caller.agency_id, decode_id, holder_id=own)
-            jobs.request_cancel(connection, caller.agency_id, decode_id, self._clock())
-            return decode_document(store.get_decode(connection, caller.agency_id, decode_id, holder_id=own))
 
 
 # === A closer look at stored decodes: samples of traces, packets of logs, the vehicle's track, lists of readings.

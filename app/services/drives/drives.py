@@ -174,13 +174,6 @@ class Drives:
             )
         return zlib.decompress(self._blobs.get(keys[name]))
 
-    def cancel(self, caller: Caller, drive_id: str) -> TrackedDriveDocument:
-        """Ask a drive to stop; a finished one stays as it is."""
-        self._get(caller, drive_id)
-        with self._database.write() as connection:
-            store.request_cancel(connection, caller.agency_id, drive_id, self._clock())
-        return self.get(caller, drive_id)
-
     def delete(self, caller: Caller, drive_id: str) -> None:
         """Delete a drive and its files; its decodes stay.
 
@@ -198,7 +191,7 @@ class Drives:
                 f"drive {drive_id} is {row.state}",
                 field="drive_id",
                 limit="drives that are finished",
-                cure=f"cancel it first: POST /v1/drives/{drive_id}/cancel",
+                cure=f"cancel it first: POST /v1/jobs/{drive_id}/cancel",
             )
         delete_unused(self._blobs, (row.result or {}).get("keys", {}).values())
 

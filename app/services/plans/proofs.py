@@ -199,8 +199,8 @@ class PlanJobPage(TypedDict):
 class PlanJobs:
     """Use cases on jobs about plans."""
 
-    def __init__(self, database: Database, clock: Clock) -> None:
-        self._database, self._clock = database, clock
+    def __init__(self, database: Database) -> None:
+        self._database = database
 
     def get(self, caller: Caller, job_id: str) -> PlanJobDocument:
         """A job with its progress, and its result once there is one.
@@ -224,19 +224,6 @@ class PlanJobs:
             )
         page = PlanJobPage(items=[plan_job_summary(row) for row in rows[:limit]])
         return page, rows[limit - 1].id if len(rows) > limit else None
-
-    def cancel(self, caller: Caller, job_id: str) -> PlanJobDocument:
-        """Cancel a job: a queued one never starts, a running one stops at its next step, a finished one stays.
-
-        Raises
-        ------
-        NotFound
-            There is none with this id, or it belongs to another agency.
-        """
-        with self._database.write() as connection:
-            store.get_job(connection, caller.agency_id, KINDS, job_id)
-            store.request_cancel(connection, caller.agency_id, job_id, self._clock())
-            return plan_job_document(store.get_job(connection, caller.agency_id, KINDS, job_id))
 
 
 def plan_job_document(job: JobRow) -> PlanJobDocument:
@@ -269,7 +256,7 @@ def check_only_one(connection: sa.Connection, agency_id: str, kind: JobKind, pla
             f"job {other.id} about this plan is {other.state}",
             field="plan_id",
             limit=f"one {kind} of a plan at a time",
-            cure=f"wait for it, or cancel it: POST /v1/plan-jobs/{other.id}/cancel",
+            cure=f"wait for it, or cancel it: POST /v1/jobs/{other.id}/cancel",
         )
 
 

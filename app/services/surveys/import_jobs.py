@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any
 
-from app.errors import Conflict
 from app.formats.format import SpooledFile
 from app.registry import jobs as store
 from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.jobs import UNFINISHED, JobKind, JobRow, new_job
+from app.registry.jobs import JobKind, new_job
 from app.services.access.access import Caller, Scope
 from app.services.blobs import staged
 from app.services.idempotency import IdempotencyKey, write_once
@@ -33,7 +32,6 @@ IMMEDIATE_LINES = 20_000
 Source: 15,000 rows a second (`python -m benchmarks.imports`), rows of a GeoPackage of 120 bytes: two seconds."""
 _BLOCK_BYTES = 1 << 18
 _STARTED = 0.1
-_TOO_LATE = "read its report; what it stored is in the history, and is changed or retired marker by marker"
 
 
 def takes_long(file: SpooledFile) -> bool:
@@ -120,24 +118,6 @@ class ImportJobs:
         page = ImportJobPage(items=[import_job_summary(row) for row in rows[:limit]])
         return page, rows[limit - 1].id if len(rows) > limit else None
 
-    def cancel(self, caller: Caller, import_id: str) -> ImportJobDocument:
-        """Cancel a job: a queued one never starts, a running one stops before it stores anything.
-
-        Raises
-        ------
-        NotFound
-            There is none with this id, or it belongs to another agency.
-        Conflict
-            It is too late: it is storing, or finished. One that was cancelled before stays cancelled.
-        """
-        with self._database.read() as connection:
-            _check_in_time(store.get_job(connection, caller.agency_id, JobKind.IMPORT, import_id))
-        with self._database.write() as connection:
-            store.request_cancel(connection, caller.agency_id, import_id, self._clock(), below_progress=SETTLED)
-            job = store.get_job(connection, caller.agency_id, JobKind.IMPORT, import_id)
-            _check_in_time(job)
-        return import_job_document(job)
-
     def run(self, job: RunningJob) -> None:
         """Import a survey that was queued; the handler of jobs of the kind `JobKind.IMPORT`."""
         row = job.row
@@ -155,14 +135,3 @@ class ImportJobs:
             report, _ = self._imports.run(caller, given, IdempotencyKey(f"import {row.id}", row.id, ""), step)
         with self._database.write() as connection:
             job.finish(connection, report)
-
-
-def _check_in_time(job: JobRow) -> None:
-    if job.state in ("done", "failed"):
-        raise Conflict(
-            f"the import is {job.state}", field="import_id", limit="imports that are not finished", cure=_TOO_LATE
-        )
-    if job.state in UNFINISHED and job.progress >= SETTLED:
-        raise Conflict(
-            "the import is storing already", field="import_id", limit="imports that store nothing yet", cure=_TOO_LATE
-        )

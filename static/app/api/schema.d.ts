@@ -885,23 +885,6 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/decodes/{decode_id}/cancel": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        get?: never;
-        put?: never;
-        /** Cancel a decode */
-        post: operations["cancel_decode"];
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
     "/v1/decodes/{decode_id}/lane.geojson": {
         parameters: {
             query?: never;
@@ -1074,23 +1057,6 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/drives/{drive_id}/cancel": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        get?: never;
-        put?: never;
-        /** Cancel a drive */
-        post: operations["cancel_drive"];
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
     "/v1/drives/{drive_id}/plot.svg": {
         parameters: {
             query?: never;
@@ -1205,23 +1171,6 @@ export interface paths {
         get: operations["get_import"];
         put?: never;
         post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/imports/{import_id}/cancel": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        get?: never;
-        put?: never;
-        /** Cancel an import */
-        post: operations["cancel_import"];
         delete?: never;
         options?: never;
         head?: never;
@@ -1736,23 +1685,6 @@ export interface paths {
         get: operations["get_plan_job"];
         put?: never;
         post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/plan-jobs/{job_id}/cancel": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        get?: never;
-        put?: never;
-        /** Cancel a job about a plan */
-        post: operations["cancel_plan_job"];
         delete?: never;
         options?: never;
         head?: never;
@@ -8618,28 +8550,6 @@ export interface operations {
             };
         };
     };
-    cancel_decode: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                decode_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["DecodeDocument"];
-                };
-            };
-        };
-    };
     get_lane: {
         parameters: {
             query?: never;
@@ -8960,28 +8870,6 @@ export interface operations {
             };
         };
     };
-    cancel_drive: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                drive_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["TrackedDriveDocument"];
-                };
-            };
-        };
-    };
     get_track_plot: {
         parameters: {
             query?: never;
@@ -9224,28 +9112,6 @@ export interface operations {
         };
     };
     get_import: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                import_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["ImportJobDocument"];
-                };
-            };
-        };
-    };
-    cancel_import: {
         parameters: {
             query?: never;
             header?: never;
@@ -10168,28 +10034,6 @@ export interface operations {
         };
     };
     get_plan_job: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                job_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
-                };
-            };
-        };
-    };
-    cancel_plan_job: {
         parameters: {
             query?: never;
             header?: never;

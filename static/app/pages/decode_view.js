@@ -139,13 +139,13 @@ function Progress({ decode, onChange }) {
     }, abort.signal).then(onChange, (problem) => abort.signal.aborted || setError(problem));
     return () => abort.abort();
   }, [decode.id]);
-  const cancel = () => attempt(() => ok(api.POST("/v1/decodes/{decode_id}/cancel", { params: { path: { decode_id: decode.id } } })));
+  const cancel = () => attempt(() => ok(api.POST("/v1/jobs/{job_id}/cancel", { params: { path: { job_id: decode.id } } })));
   return html`
     <section class="card job">
       <${ProblemBox} error=${error} />
       <p role="status">${textOr(`job.${job?.state ?? decode.state}`, decode.state)}${job?.total ? ` ${t("job.steps", { done: job.done ?? 0, total: job.total })}` : ""}${job?.rate_per_s ? `, ${t("decode.rate", { rate: number(job.rate_per_s, 1) })}` : ""}</p>
       <progress aria-label=${t("job.progress")} max="1" value=${job?.progress ?? decode.progress}></progress>
-      ${may("POST /v1/decodes/{decode_id}/cancel") && html`<p><button type="button" class="quiet" onClick=${cancel}>${t("action.cancel")}</button></p>`}
+      ${may("POST /v1/decodes") && html`<p><button type="button" class="quiet" onClick=${cancel}>${t("action.cancel")}</button></p>`}
       <p class="hint">${t("decode.leave")}</p>
     </section>
   `;

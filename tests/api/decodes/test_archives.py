@@ -132,6 +132,10 @@ def test_a_frame_of_another_size_than_the_camera_is_named(client: httpx.Client) 
     assert second["error"]["field"] == "camera.width_px"
 
 
+def _cancel(client: httpx.Client, location: str) -> httpx.Response:
+    return client.post(f"/v1/jobs/{location.rpartition('/')[2]}/cancel")
+
+
 @pytest.mark.slow
 def test_a_running_job_can_be_cancelled(impatient: httpx.Client) -> None:
     client = impatient
@@ -139,14 +143,14 @@ def test_a_running_job_can_be_cancelled(impatient: httpx.Client) -> None:
     answer = post_frame(client, pack({f"{k}.png": slow for k in range(12)}))
     location = answer.headers["location"]
     waiting = post_frame(client, pack({"later.png": GOOD})).headers["location"]
-    assert client.post(f"{waiting}/cancel").json()["state"] == "cancelled"
+    assert _cancel(client, waiting).json()["state"] == "cancelled"
     wait_until(lambda: client.get(location).json()["state"] != "queued", "the job to start")
-    assert client.post(f"{location}/cancel").json()["state"] == "running"
+    assert _cancel(client, location).json()["state"] == "running"
     decode = wait_for(client, location, "cancelled")
     assert decode["finished_at"]
     assert "readings" not in decode
     assert client.get(f"{location}/annotated.jpg").status_code == 404
-    assert client.post(f"{location}/cancel").json()["state"] == "cancelled"
+    assert _cancel(client, location).json()["state"] == "cancelled"
 
 
 def test_an_idempotency_key_queues_once(client: httpx.Client, stored: Stored) -> None:

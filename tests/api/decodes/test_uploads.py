@@ -337,7 +337,7 @@ def test_agencies_never_see_each_other(server: LiveServer, client: httpx.Client,
     with server.agency("strangers") as stranger:
         for path in ("", "/annotated.png", "/annotated.jpg"):
             assert stranger.get(f"/v1/decodes/{decode['id']}{path}").status_code == 404
-        assert stranger.post(f"/v1/decodes/{decode['id']}/cancel").status_code == 404
+        assert stranger.post(f"/v1/jobs/{decode['id']}/cancel").status_code == 404
         assert stranger.get("/v1/decodes").json() == {"items": []}
         mine = post_frame(stranger, GOOD, near(plate)).json()
         assert mine["codebook_plates"] == 0

@@ -303,7 +303,7 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         rules = {"version": 1, "plates": {}}
         plan = _made(owner.post("/v1/plans", json={"name": "p", "alignment_id": alignment, "rules": rules}))["id"]
         job = owner.post(f"/v1/plans/{plan}/proof", json={}, headers={"If-Match": "*"}).json()["id"]
-        owner.post(f"/v1/plan-jobs/{job}/cancel")
+        owner.post(f"/v1/jobs/{job}/cancel")
         hook = _made(owner.post("/v1/webhooks", json={"url": "https://example.org/", "events": ["nothing"]}))["id"]
         verification = owner.post("/v1/audit/verifications", json={}).json()["id"]
         upload = owner.post("/v1/uploads", headers={**TUS, "Upload-Length": "9"}).headers["Location"].rsplit("/", 1)[1]

@@ -132,7 +132,7 @@ def test_an_interrupted_or_cancelled_package_leaves_nothing(
 
     def cancel(count: int) -> None:
         if count == 3:
-            client.post(f"/v1/plan-jobs/{job['id']}/cancel")
+            client.post(f"/v1/jobs/{job['id']}/cancel")
 
     monkeypatch.setattr(packages, "_processes", Watched(processes, cancel))
     jobs.run_job(job["id"])

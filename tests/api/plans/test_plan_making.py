@@ -82,7 +82,7 @@ def test_a_job_that_is_run_twice_makes_one_plan(
     jobs.run_job(queued[0])
     assert [plan["name"] for plan in client.get("/v1/plans").json()["items"]] == [body["name"]]
     waiting = client.post("/v1/plans", json=body | {"name": "never"}, headers=LATER).json()
-    assert client.post(f"/v1/plan-jobs/{waiting['id']}/cancel").json()["state"] == "cancelled"
+    assert client.post(f"/v1/jobs/{waiting['id']}/cancel").json()["state"] == "cancelled"
     jobs.run_job(waiting["id"])
     assert len(client.get("/v1/plans").json()["items"]) == 1
 

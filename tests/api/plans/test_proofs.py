@@ -147,7 +147,7 @@ def test_uploads_are_decoded_while_a_proof_runs(client: httpx.Client, plan: dict
         assert client.post("/v1/decodes", **frame).status_code == 201
         job = client.get(location).json()
         assert (job["state"], job["steps_total"]) == ("running", 200)
-    client.post(f"{location}/cancel")
+    client.post(f"/v1/jobs/{location.rpartition('/')[2]}/cancel")
     assert finished(client, location)["state"] == "cancelled"
 
 
@@ -221,15 +221,15 @@ def test_a_cancelled_proof_stops_and_leaves_the_plan(
 ) -> None:
     queued = prove_plan(client, plan).json()
     with server.agency("provers of others") as other:
-        refused(other.post(f"/v1/plan-jobs/{queued['id']}/cancel"), 404)
-    assert client.post(f"/v1/plan-jobs/{queued['id']}/cancel").json()["state"] == "cancelled"
+        refused(other.post(f"/v1/jobs/{queued['id']}/cancel"), 404)
+    assert client.post(f"/v1/jobs/{queued['id']}/cancel").json()["state"] == "cancelled"
     server.app.state.use_cases.jobs.run_job(queued["id"])
     job = prove_plan(client, plan).json()
     proofs = server.app.state.use_cases.proofs
 
     def cancel(count: int) -> None:
         if count == 1:
-            assert client.post(f"/v1/plan-jobs/{job['id']}/cancel").json()["state"] == "running"
+            assert client.post(f"/v1/jobs/{job['id']}/cancel").json()["state"] == "running"
 
     watched = Watched(proofs._processes, cancel)
     monkeypatch.setattr(proofs, "_processes", watched)
@@ -238,7 +238,8 @@ def test_a_cancelled_proof_stops_and_leaves_the_plan(
     assert (ended["state"], ended["result"], ended["cancel_requested"]) == ("cancelled", None, True)
     assert watched.units < 4
     assert client.get(f"/v1/plans/{plan['id']}").json() == plan
-    assert client.post(f"/v1/plan-jobs/{job['id']}/cancel").json() == ended
+    assert client.post(f"/v1/jobs/{job['id']}/cancel").json()["state"] == "cancelled"
+    assert client.get(f"/v1/plan-jobs/{job['id']}").json() == ended
     by_state = client.get("/v1/plan-jobs", params={"state": "cancelled"}).json()["items"]
     assert [one["id"] for one in by_state] == [job["id"], queued["id"]]
 
@@ -362,7 +363,7 @@ def test_too_many_units_and_nothing_to_drive_are_refused(client: httpx.Client, p
     many = {"drives": prove.MAX_UNITS, "max_markers_per_drive": 1000}
     job = client.post(f"/v1/plans/{plan['id']}/proof", json=many, headers=FIRST)
     assert job.status_code == 202, job.text
-    client.post(f"{job.headers['Location']}/cancel")
+    client.post(f"/v1/jobs/{job.json()['id']}/cancel")
     closer = make_plan(client, {"version": 1, "plates": {"spacing_m": 20}})
     problem = refused(client.post(f"/v1/plans/{closer['id']}/proof", json=many, headers=FIRST), 422, field="drives")
     assert str(prove.MAX_UNITS) in problem["limit"]
