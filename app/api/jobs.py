@@ -273,7 +273,7 @@ def get_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
     return json_response(document, headers={"Retry-After": "1"} if waiting else None)
 
 
-# viewers cancel artwork and exports that they asked for; app/services/progress.py says which kinds a scope sees
+# viewers cancel the artwork and exports that they asked for; app/services/progress.py lists the kinds of each scope
 @router.post("/{job_id}/cancel", EVERYBODY, responses=document_response(JobDocument, 404, 409))
 def cancel_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
     """Cancel a job.

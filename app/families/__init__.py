@@ -36,5 +36,5 @@ def union_of(shapes: Iterable[Any]) -> Any:
 
 
 def union_of_documents(documents: Iterable[Any]) -> Any:
-    """The union of the documents of families; the member `family` says which of them a document is."""
+    """The union of the documents of families; the member `family` tells them apart."""
     return Annotated[union_of(documents), Discriminator("family")]

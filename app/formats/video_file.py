@@ -222,7 +222,7 @@ def open_packed_video(file: SpooledFile, limits: ArchiveLimits) -> PackedVideo:
 
 
 SEGMENT_S = 10.0
-"""[s] of a video that one task decodes. Source: chosen by hand: progress and cancelling every few seconds."""
+"""[s] of a video that one task decodes. Progress and cancelling every few seconds."""
 GAP_S, GAP_FACTOR = 1.0, 5.0
 """[s, 1] as in `app.services.decodes.frame_poses`."""
 

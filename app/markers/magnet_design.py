@@ -181,7 +181,7 @@ def _compositions(total: int, parts: int, least: int) -> Iterator[tuple[int, ...
 
 FloatArray = npt.NDArray[np.float64]
 MAX_PLACEMENTS = 4000
-"""Placements that are examined at most; of larger designs, so many at equal ranks. Source: chosen by hand for speed
+"""Placements that are examined at most; of larger designs, so many at equal ranks. Chosen for speed
 (docs/decisions/0013-magnet-tags.md has the times)."""
 
 
@@ -206,9 +206,9 @@ class MagnetErrorModel:
     noise_ut: float = 1.5
     moment_am2: float = MOMENT_AM2  # [A m2] magnetic moment of a magnet
     sample_rate_hz: float = 350.0  # of the magnetometers. [Hz] Source: METRO section 6.1.
-    channels: float = 4.0  # sensor axes of like strength whose evidence the decoder adds up. Source: chosen by hand.
+    channels: float = 4.0  # sensor axes of like strength whose evidence the decoder adds up
     # standard deviation of the time at which a magnet is placed, beyond noise: jitter of the samples, or their interval
-    # / sqrt(12) for a decoder that works in whole samples. [s] Source: chosen by hand.
+    # / sqrt(12) for a decoder that works in whole samples. [s]
     timing_s: float = 0.0001
 
     def __post_init__(self) -> None:
@@ -236,10 +236,9 @@ METRO_ERROR = MagnetErrorModel(channels=1.0, timing_s=1 / 350 / math.sqrt(12))
 class OdometerError:
     """Errors of the vehicle's speed that do not cancel in a ratio."""
 
-    quantum_mps: float = 0.01  # step of the speed signal. [m/s] Source: chosen by hand.
+    quantum_mps: float = 0.01  # [m/s] step of the speed signal
     rate_hz: float = 10.0  # speeds per second. [Hz] Source: METRO section 7.1.
-    # standard deviation of the relative change of scale from one gap to the next (slip, braking, latency). Source:
-    # chosen by hand.
+    # standard deviation of the relative change of scale from one gap to the next (slip, braking, latency)
     drift: float = 0.001
 
     def __post_init__(self) -> None:

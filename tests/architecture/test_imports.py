@@ -18,8 +18,8 @@ CORE = (
     "planning", "surveys", "simulation", "encoders", "decoders", "lanes", "formats", "radio", "calibration", "markers",
     "sensors", "roads", "geodesy", "errors", "tracks", "health",
 )  # fmt: skip
-MAX_LINES = 850
-MAX_FILES = 520
+MAX_LINES = 750
+MAX_FILES = 500
 
 
 def _modules(prefix: str = "app") -> list[str]:

@@ -1,6 +1,6 @@
 """Who may call what: scopes, which routes name at their functions, and the key in a request.
 
-The middleware asks before a body is read. A path without a route is refused to everybody. docs/access.md says what each
+The middleware asks before a body is read. A path without a route is refused. docs/access.md says what each
 scope is for.
 """
 

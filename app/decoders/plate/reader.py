@@ -1,8 +1,8 @@
 """Frame to readings: find candidates, fit each, measure its units, decode their symbols, accept or refuse.
 
 In a colour frame red and green are searched by their difference first, by their ratio where that gives no digits. A
-thermal frame has no colours: each warm quadrangle is fitted in four orientations. `marker_colours` says which colours a
-plate has, `evidence` when its digits are returned.
+thermal frame has no colours: each warm quadrangle is fitted in four orientations. `marker_colours` tests the colours of
+a plate, `evidence` decides when its digits are returned.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from app.formats.images import ImageLimits, load_image
 from app.services.decoder_tasks import decoder_task
 
 MAX_SIDE_PX = 2048
-"""Longest side of the stored photo. [px] Source: chosen by hand: damage is seen, and a photo takes 0.5 MB."""
+"""Longest side of the stored photo. [px] Damage can be seen, and a photo takes 0.5 MB."""
 JPEG_QUALITY = 85
 
 
