@@ -39,7 +39,7 @@ Floats = npt.NDArray[np.float64]
 BOOK: dict[str, Any] = {
     "name": "Demo lane",
     "design": {"magnets": 3, "length_m": 4.0, "segment_m": 1.0},
-    "rules": {"speed_mps": 13.9, "clearance_m": 0.3, "wrong_way_safe": True},
+    "rules": {"speed_m_s": 13.9, "clearance_m": 0.3, "wrong_way_safe": True},
     "meanings": [
         {"kind": "speed-limit-kmh", "value": 50},
         {"kind": "bend-left", "value": 18},
@@ -156,7 +156,7 @@ def build(client: httpx.Client, folder: Path, rng: np.random.Generator) -> Built
     for meaning, at in zip(BOOK["meanings"], TAGS_M, strict=False):
         tag = {"codebook_id": book["id"], "meaning": meaning, "chainage_m": at}
         ahead = {"stop_line_chainage_m": STOP_LINE_M} if meaning["kind"] == "stop-line-ahead" else {}
-        body = _body(built.lane, 0.0) | {"tag": tag, "site": {"design_speed_mps": 13.9, **ahead}}
+        body = _body(built.lane, 0.0) | {"tag": tag, "site": {"design_speed_m_s": 13.9, **ahead}}
         built.tags.append(checked(client.post("/v1/markers", json=body)).json())
     for style, left_m in LINES.items():
         line = {"style": style, "from_m": 10.0, "to_m": 340.0, "spacing_m": 5.0}

@@ -259,7 +259,7 @@ def _demonstrate_cerpms(client: httpx.Client, out: Path, say: Say) -> tuple[list
     (folder / "programs.csv").write_text(built.table)
     dump = checked(client.get(f"/v1/markers/{built.markers[0]['id']}/payload.hex")).text
     (folder / "payload.txt").write_text(dump)
-    plan = {"radio": {"interval_s": INTERVAL_S}, "design_speed_mps": 8.3, "recommend": True}
+    plan = {"radio": {"interval_s": INTERVAL_S}, "design_speed_m_s": 8.3, "recommend": True}
     check = checked(client.post("/v1/radio-checks", json=plan)).json()
     (folder / "radio-check.json").write_text(json.dumps(check, indent=2) + "\n")
     say(f"Radio check: at one transmission every {INTERVAL_S:g} s {check['read_probability']:.1%} of markers are read")

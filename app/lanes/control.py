@@ -167,7 +167,7 @@ def _chord_headings(points: Floats, reach: int) -> Floats:
 def plan_speed(
     path: FollowedPath,
     path_enu_m: npt.ArrayLike,
-    speed_limit_km_h: npt.ArrayLike,
+    speed_limit_kmh: npt.ArrayLike,
     *,
     comfort_m_s2: float = 2.0,
     braking_m_s2: float = 1.5,
@@ -178,7 +178,7 @@ def plan_speed(
     ----------
     path_enu_m : array_like, shape (S, 2)
         The points that `path` was made of.
-    speed_limit_km_h : float or array_like, shape (S,)
+    speed_limit_kmh : float or array_like, shape (S,)
         For the whole path, or at its points; holds from its point on. [km/h]
     comfort_m_s2 : float
         Lateral acceleration in bends. [m/s2]
@@ -195,13 +195,13 @@ def plan_speed(
     InvalidParameter
         A limit is not from 5 to 250 km/h, or there is not one for each point.
     """
-    limits, points = np.asarray(speed_limit_km_h, float), np.asarray(path_enu_m, float)
+    limits, points = np.asarray(speed_limit_kmh, float), np.asarray(path_enu_m, float)
     if limits.ndim > 1 or (limits.ndim == 1 and len(limits) != len(points)):
         raise InvalidParameter(
-            "there is not one speed limit for each point", field="speed_limit_km_h", limit="one, or one per point"
+            "there is not one speed limit for each point", field="speed_limit_kmh", limit="one, or one per point"
         )
     if not (np.isfinite(limits).all() and (limits >= 5).all() and (limits <= 250).all()):
-        raise InvalidParameter("a speed limit is out of range", field="speed_limit_km_h", limit="5 to 250 km/h")
+        raise InvalidParameter("a speed limit is out of range", field="speed_limit_kmh", limit="5 to 250 km/h")
     count = len(path.heading_rad)
     if limits.ndim == 1:
         chainage = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))

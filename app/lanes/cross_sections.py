@@ -35,7 +35,7 @@ class CrossSections:
     left_m: Floats
     right_m: Floats
     yaw_rad: Floats  # shape (N,): [rad] direction of the smoothed centre line, anticlockwise from east, unwrapped
-    curvature_1pm: Floats  # shape (N,): [1/m] of the smoothed centre line, positive to the left
+    curvature_per_m: Floats  # shape (N,): [1/m] of the smoothed centre line, positive to the left
     # `along_left_m`, `along_right_m`: shape (N,): [m] chainages on the boundaries where the cut meets them
     along_left_m: Floats
     along_right_m: Floats

@@ -59,7 +59,7 @@ def path_from_fit(fit: LaneFit, observations: LaneObservations, rules: LaneRules
         for sign, known in ((1, sigma_left), (-1, sigma_right))
     )
     lon, lat = wgs84_from_plane(path.points_m, observations.origin)
-    limit = _speed_limits(at, inner, observations.speed_limit_km_h[fit.used], notes)
+    limit = _speed_limits(at, inner, observations.speed_limit_kmh[fit.used], notes)
     row_side, row_residual = _by_row(fit, observations)
     if len(at[keep]) and float(np.max(sigma[keep])) > rules.max_end_sigma_m:
         notes.warn(f"the path is inaccurate in places: up to {float(np.max(sigma[keep])):.2f} m")
@@ -73,9 +73,9 @@ def path_from_fit(fit: LaneFit, observations: LaneObservations, rules: LaneRules
         lon_deg=lon[keep],
         lat_deg=lat[keep],
         heading_deg=headings_deg(lon, lat)[keep],
-        curvature_1pm=path.curvature_1pm[keep],
+        curvature_per_m=path.curvature_per_m[keep],
         width_m=np.where(sigma_width < _MAX_WIDTH_SIGMA_M, width, np.nan)[keep],
-        speed_limit_km_h=limit[keep],
+        speed_limit_kmh=limit[keep],
         sigma_m=sigma[keep],
         confidence=_confidence(sigma[keep], rules.tolerance_m),
         side=row_side,
@@ -121,9 +121,9 @@ def path_from_splines(bounds: SplineBoundaries, observations: LaneObservations, 
         lon_deg=lon,
         lat_deg=lat,
         heading_deg=headings_deg(lon, lat),
-        curvature_1pm=curvature,
+        curvature_per_m=curvature,
         width_m=np.hypot(*(left - right).T),
-        speed_limit_km_h=_speed_limits(at, markers_at[taken], observations.speed_limit_km_h[taken], notes),
+        speed_limit_kmh=_speed_limits(at, markers_at[taken], observations.speed_limit_kmh[taken], notes),
         sigma_m=none,
         confidence=none,
         side=np.where(known, bounds.side[observations.of_row], UNKNOWN),
@@ -148,9 +148,9 @@ def refused_path(observations: LaneObservations, notes: Notes, reason: str, meth
         lon_deg=none,
         lat_deg=none,
         heading_deg=none,
-        curvature_1pm=none,
+        curvature_per_m=none,
         width_m=none,
-        speed_limit_km_h=none,
+        speed_limit_kmh=none,
         sigma_m=none,
         confidence=none,
         side=np.zeros(rows, np.int64),
@@ -251,7 +251,7 @@ class _Compared(NamedTuple):
     fix_m: Floats
     place_m: Floats
     normal: Floats
-    curvature_1pm: Floats
+    curvature_per_m: Floats
 
 
 def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
@@ -274,7 +274,7 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
     priors, and repeated until the places do not move. Wander is correlated over 30 m, so fixes count less. The
     receiver's accuracy, which a slow error takes up whole, is added to what the geometry leaves open.
     """
-    if not len(lane.station_m) or np.isnan(lane.curvature_1pm).any() or (np.abs(track.lat_deg) > 90).any():
+    if not len(lane.station_m) or np.isnan(lane.curvature_per_m).any() or (np.abs(track.lat_deg) > 90).any():
         return None
     fixes, spacing_m = _thinned(
         plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
@@ -342,7 +342,7 @@ def _beside(lane: Lane, tree: scipy.spatial.cKDTree, fixes_m: Floats, moved_m: F
     at = index[keep]
     yaw = np.radians(90.0 - lane.heading_deg[at])
     normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
-    return _Compared(fixes_m[keep], lane.position_enu_m[at], normal, lane.curvature_1pm[at])
+    return _Compared(fixes_m[keep], lane.position_enu_m[at], normal, lane.curvature_per_m[at])
 
 
 def _solve(compared: _Compared, middle_m: Floats, values: Floats, noise_m: float) -> tuple[Floats, Floats]:

@@ -295,7 +295,7 @@ class LaneProblem:
         np.add.at(inside, first, 1)
         np.add.at(inside, last, -1)
         k = np.flatnonzero(np.cumsum(inside)[:-1] > 0)
-        bend = np.interp(self.station_m, line.station_m, line.curvature_1pm)
+        bend = np.interp(self.station_m, line.station_m, line.curvature_per_m)
         index = np.stack([3 * k, 3 * k + 2, 3 * k + 3, 3 * k + 5], 1)
         ones = np.ones(len(k))
         value = np.stack([h * bend[k] / 2, -ones, h * bend[k + 1] / 2, ones], 1)

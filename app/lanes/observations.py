@@ -38,9 +38,9 @@ class LaneObservations:
     number: Ints  # shape (M,)
     point_m: Floats  # shape (M, 2): [m] east and north
     side: Ints  # shape (M,)
-    # `sigma_m`, `speed_limit_km_h`: shape (M,)
+    # `sigma_m`, `speed_limit_kmh`: shape (M,)
     sigma_m: Floats
-    speed_limit_km_h: Floats
+    speed_limit_kmh: Floats
     of_row: Ints  # shape (K,): row of these for each row of `LaneMarkers`; -1 for none
 
 
@@ -75,7 +75,7 @@ def observations_from_markers(markers: LaneMarkers, rules: LaneRules, notes: Not
         point_m=mean[good],
         side=side[good],
         sigma_m=sigma[first][good],
-        speed_limit_km_h=markers.speed_limit_km_h[chosen][good],
+        speed_limit_kmh=markers.speed_limit_kmh[chosen][good],
         of_row=of_row,
     )
 

@@ -94,7 +94,7 @@ class SmoothLine:
         self.tangent = slope / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9)[:, None]
         bend = spline(knots, 2)
         speed = np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-3)
-        self.curvature_1pm: Floats = (slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]) / speed**3
+        self.curvature_per_m: Floats = (slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]) / speed**3
         self._step_m = float(self.station_m[-1]) / (count - 1)
 
     @property

@@ -53,7 +53,7 @@ class LaneMarkers:
     lat_deg: Floats
     side: Ints  # shape (K,): `LaneSide` values
     sigma_m: Floats  # shape (K,): [m] standard deviation of the survey on each axis; 0.02 m where it is not known
-    speed_limit_km_h: Floats  # shape (K,): [km/h] NaN where none is posted
+    speed_limit_kmh: Floats  # shape (K,): [km/h] NaN where none is posted
 
     def __post_init__(self) -> None:
         lengths = set()
@@ -188,9 +188,9 @@ class Lane:
     lon_deg: Floats
     lat_deg: Floats
     heading_deg: Floats  # shape (S,): [deg] in the direction of travel, clockwise from true north there
-    curvature_1pm: Floats  # shape (S,): [1/m] positive to the left
+    curvature_per_m: Floats  # shape (S,): [1/m] positive to the left
     width_m: Floats  # shape (S,): [m] NaN where only the usual width is known
-    speed_limit_km_h: Floats  # shape (S,): [km/h] sent by the marker passed last; NaN where none is posted
+    speed_limit_kmh: Floats  # shape (S,): [km/h] sent by the marker passed last; NaN where none is posted
     sigma_m: Floats  # shape (S,): [m] standard deviation of the path across its direction
     confidence: Floats  # shape (S,): probability that the path is within `LaneRules.tolerance_m` of the centre
     side: Ints  # shape (K,): boundary that each marker was assigned to; 0 for markers that were not used

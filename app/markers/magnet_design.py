@@ -214,7 +214,7 @@ class MagnetErrorModel:
     def __post_init__(self) -> None:
         _check_fields(self, may_be_zero=("placement_m", "noise_ut", "timing_s"))
 
-    def position_std_m(self, speed_mps: float, clearance_m: float) -> float:
+    def position_std_m(self, speed_m_s: float, clearance_m: float) -> float:
         """Standard deviation of a magnet's place along the lane. [m]
 
         Notes
@@ -223,9 +223,9 @@ class MagnetErrorModel:
         above a lying magnet falls with the cube of the clearance h, the samples rise with h / speed.
         """
         amplitude_ut = FIELD_UT_M3 * self.moment_am2 / clearance_m**3
-        samples = self.channels * self.sample_rate_hz * clearance_m / speed_mps
+        samples = self.channels * self.sample_rate_hz * clearance_m / speed_m_s
         noise_m = clearance_m * (self.noise_ut / amplitude_ut) / math.sqrt(samples)
-        return math.hypot(noise_m, self.placement_m, self.timing_s * speed_mps)
+        return math.hypot(noise_m, self.placement_m, self.timing_s * speed_m_s)
 
 
 METRO_ERROR = MagnetErrorModel(channels=1.0, timing_s=1 / 350 / math.sqrt(12))
@@ -236,17 +236,17 @@ METRO_ERROR = MagnetErrorModel(channels=1.0, timing_s=1 / 350 / math.sqrt(12))
 class OdometerError:
     """Errors of the vehicle's speed that do not cancel in a ratio."""
 
-    quantum_mps: float = 0.01  # [m/s] step of the speed signal
+    quantum_m_s: float = 0.01  # [m/s] step of the speed signal
     rate_hz: float = 10.0  # speeds per second. [Hz] Source: METRO section 7.1.
     # standard deviation of the relative change of scale from one gap to the next (slip, braking, latency)
     drift: float = 0.001
 
     def __post_init__(self) -> None:
-        _check_fields(self, may_be_zero=("quantum_mps", "drift"))
+        _check_fields(self, may_be_zero=("quantum_m_s", "drift"))
 
-    def gap_std_m(self, gaps_m: FloatArray, speed_mps: float) -> FloatArray:
+    def gap_std_m(self, gaps_m: FloatArray, speed_m_s: float) -> FloatArray:
         """Standard deviation of the length of gaps, same shape. [m]"""
-        quantised = self.quantum_mps / math.sqrt(12) * np.sqrt(gaps_m / speed_mps / self.rate_hz)
+        quantised = self.quantum_m_s / math.sqrt(12) * np.sqrt(gaps_m / speed_m_s / self.rate_hz)
         return np.hypot(quantised, self.drift * gaps_m)
 
 
@@ -254,14 +254,14 @@ class OdometerError:
 class ReadingConditions:
     """Conditions under which a code must be read: the fastest and highest vehicle, its odometer and its decoder."""
 
-    speed_mps: float = 13.4
+    speed_m_s: float = 13.4
     clearance_m: float = 0.30  # [m] of the sensors above the magnets
     odometer: OdometerError = field(default_factory=OdometerError)
     model: MagnetErrorModel = field(default_factory=MagnetErrorModel)
 
     def __post_init__(self) -> None:
         for name, value, limits, unit in (
-            ("speed_mps", self.speed_mps, (0.5, 70.0), "m/s"),
+            ("speed_m_s", self.speed_m_s, (0.5, 70.0), "m/s"),
             ("clearance_m", self.clearance_m, (0.05, 1.0), "m"),
         ):
             if not limits[0] <= value <= limits[1]:
@@ -286,10 +286,10 @@ def covariance_of(gaps_m: FloatArray, conditions: ReadingConditions) -> FloatArr
     ndarray, shape (K, M - 2, M - 2)
     """
     count = gaps_m.shape[1]
-    place_std = conditions.model.position_std_m(conditions.speed_mps, conditions.clearance_m)
+    place_std = conditions.model.position_std_m(conditions.speed_m_s, conditions.clearance_m)
     differences = np.eye(count, count + 1, k=1) - np.eye(count, count + 1)
     of_gaps = place_std**2 * (differences @ differences.T)
-    gap_std = conditions.odometer.gap_std_m(gaps_m, conditions.speed_mps)
+    gap_std = conditions.odometer.gap_std_m(gaps_m, conditions.speed_m_s)
     of_gaps = of_gaps + gap_std[:, :, None] * np.eye(count) * gap_std[:, None, :]
     length = gaps_m.sum(axis=1)[:, None, None]
     u = np.cumsum(gaps_m, axis=1)[:, :-1] / length[:, :, 0]
@@ -301,8 +301,8 @@ def covariance_of(gaps_m: FloatArray, conditions: ReadingConditions) -> FloatArr
 def ratio_std(gaps_m: Sequence[float], conditions: ReadingConditions) -> tuple[float, ...]:
     """Standard deviation of the deviation ratio (measured over true ratio) of d_2/d_1 .. d_(M-1)/d_1, length M - 2."""
     gaps = np.asarray(gaps_m, dtype=np.float64)
-    place_std = conditions.model.position_std_m(conditions.speed_mps, conditions.clearance_m)
-    own = (conditions.odometer.gap_std_m(gaps, conditions.speed_mps) / gaps) ** 2
+    place_std = conditions.model.position_std_m(conditions.speed_m_s, conditions.clearance_m)
+    own = (conditions.odometer.gap_std_m(gaps, conditions.speed_m_s) / gaps) ** 2
     stds = []
     for i in range(1, len(gaps)):
         ends = np.zeros(len(gaps) + 1)

@@ -112,7 +112,7 @@ class Lane:
     grade: Floats  # shape (N,): [-] rise per distance, 0 where heights are unknown
     superelevation_rad: Floats  # shape (N,): [rad] positive falls to the right
     width_m: Floats  # shape (N,)
-    design_speed_mps: Floats  # shape (N,)
+    design_speed_m_s: Floats  # shape (N,)
     # shape (N,): [m] True distance along the road's reference line; decreases in lanes of the opposite direction
     station_m: Floats
     # `left_style`, `right_style`: paint of the boundaries

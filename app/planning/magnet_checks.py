@@ -63,7 +63,7 @@ HALF_BAR_M = 1.77 / 2
 """Half of METRO's sensor bar. [m] Source: METRO section 5.1."""
 REACTION_S = 2.5
 """Brake reaction time. [s] Source: AASHTO Green Book (2018), section 3.2.2."""
-DECELERATION_MPS2 = 3.4
+DECELERATION_M_S2 = 3.4
 """Comfortable deceleration. [m/s2] Source: AASHTO Green Book (2018), section 3.2.2. By these two the 20 m before a stop
 line of METRO section 6.3 serve up to 5.9 m/s."""
 _SERVED = 0.95  # share of a kind of vehicle that must have a readable clearance
@@ -96,26 +96,26 @@ class Site:
         A value is outside its limits, or a kind of vehicle is unknown.
     """
 
-    design_speed_mps: float | None = None  # [m/s]
+    design_speed_m_s: float | None = None  # [m/s]
     # [m] of the stop line that the tag announces, on the same line; needs the design speed
     stop_line_chainage_m: float | None = None
     vehicles: tuple[str, ...] = ("sedan", "utility")  # kinds of vehicle to be served, of `vehicle_clearances`
     readable_clearance_m: float = READABLE_CLEARANCE_M  # [m] up to which clearance the decoder reads
     neighbours: tuple[Neighbour, ...] = field(default=())  # markers nearby: of other lanes, of lines, of other tags
-    # `reaction_s`, `deceleration_mps2`: [m/s2] of the driver or the system that acts on the tag. [s],
+    # `reaction_s`, `deceleration_m_s2`: [m/s2] of the driver or the system that acts on the tag. [s],
     reaction_s: float = REACTION_S
-    deceleration_mps2: float = DECELERATION_MPS2
+    deceleration_m_s2: float = DECELERATION_M_S2
 
     def __post_init__(self) -> None:
-        _check_range("design_speed_mps", self.design_speed_mps, 0.5, 70.0, "m/s")
+        _check_range("design_speed_m_s", self.design_speed_m_s, 0.5, 70.0, "m/s")
         _check_range("stop_line_chainage_m", self.stop_line_chainage_m, -1e5, 1e5, "m")
         _check_range("readable_clearance_m", self.readable_clearance_m, 0.05, 1.0, "m")
         _check_range("reaction_s", self.reaction_s, 0.0, 10.0, "s")
-        _check_range("deceleration_mps2", self.deceleration_mps2, 0.5, 10.0, "m/s2")
-        if self.stop_line_chainage_m is not None and self.design_speed_mps is None:
+        _check_range("deceleration_m_s2", self.deceleration_m_s2, 0.5, 10.0, "m/s2")
+        if self.stop_line_chainage_m is not None and self.design_speed_m_s is None:
             raise InvalidParameter(
                 "the distance to a stop line is checked for the design speed, which is missing",
-                field="design_speed_mps",
+                field="design_speed_m_s",
                 limit="0.5 to 70 m/s",
                 cure="give the design speed",
             )
@@ -140,10 +140,10 @@ def vehicle_clearances() -> dict[str, tuple[float, float]]:
 
 
 def reaction_distance_m(
-    speed_mps: float, reaction_s: float = REACTION_S, deceleration: float = DECELERATION_MPS2
+    speed_m_s: float, reaction_s: float = REACTION_S, deceleration: float = DECELERATION_M_S2
 ) -> float:
     """Distance in which a vehicle stops, v t + v^2 / 2 a: AASHTO's stopping sight distance on the level. [m]"""
-    return speed_mps * reaction_s + speed_mps**2 / (2 * deceleration)
+    return speed_m_s * reaction_s + speed_m_s**2 / (2 * deceleration)
 
 
 def check_layout(layout: MagnetLayout, site: Site) -> tuple[Check, ...]:
@@ -159,8 +159,8 @@ def check_layout(layout: MagnetLayout, site: Site) -> tuple[Check, ...]:
         checks.append(_line_spacing(layout))
     else:
         checks.append(_bend(layout))
-        if site.stop_line_chainage_m is not None and site.design_speed_mps is not None:
-            checks.append(_reaction(layout, site.stop_line_chainage_m, site.design_speed_mps, site))
+        if site.stop_line_chainage_m is not None and site.design_speed_m_s is not None:
+            checks.append(_reaction(layout, site.stop_line_chainage_m, site.design_speed_m_s, site))
     checks += [_clearance(name, site.readable_clearance_m) for name in site.vehicles]
     checks += _neighbours(layout, site.neighbours)
     return tuple(checks)
@@ -209,15 +209,15 @@ def _bend(layout: MagnetLayout) -> Check:
     )
 
 
-def _reaction(layout: MagnetLayout, stop_line_m: float, speed_mps: float, site: Site) -> Check:
+def _reaction(layout: MagnetLayout, stop_line_m: float, speed_m_s: float, site: Site) -> Check:
     return _at_least(
         "reaction-distance",
         stop_line_m - layout.holes[-1].chainage_m,
-        reaction_distance_m(speed_mps, site.reaction_s, site.deceleration_mps2),
+        reaction_distance_m(speed_m_s, site.reaction_s, site.deceleration_m_s2),
         "m",
         "AASHTO Green Book (2018), section 3.2.2",
-        f"last magnet to stop line; v t + v²/2a of {speed_mps:g} m/s, {site.reaction_s:g} s, "
-        f"{site.deceleration_mps2:g} m/s²",
+        f"last magnet to stop line; v t + v²/2a of {speed_m_s:g} m/s, {site.reaction_s:g} s, "
+        f"{site.deceleration_m_s2:g} m/s²",
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from app.errors import InvalidParameter
 from app.markers.cerpm import MESSAGE_BYTES
 from app.markers.reading import RadioFinding, Verdict, at_least
-from app.planning.magnet_checks import DECELERATION_MPS2, REACTION_S, reaction_distance_m
+from app.planning.magnet_checks import DECELERATION_M_S2, REACTION_S, reaction_distance_m
 from app.radio.link import LinkModel
 from app.radio.reception import (
     LANE_WIDTH_M,
@@ -57,21 +57,21 @@ class PreviewRule:
 
     # [m] fixed, 1 to 2,000. By default it is the distance in which the vehicle stops, and at least the camera's 31 m.
     distance_m: float | None = None
-    # `reaction_s`, `deceleration_mps2`: of the driver or the system; by default AASHTO Green Book (2018), 3.2.2
+    # `reaction_s`, `deceleration_m_s2`: of the driver or the system; by default AASHTO Green Book (2018), 3.2.2
     reaction_s: float = REACTION_S
-    deceleration_mps2: float = DECELERATION_MPS2
+    deceleration_m_s2: float = DECELERATION_M_S2
 
     def __post_init__(self) -> None:
         if self.distance_m is not None:
             check_between("preview.distance_m", self.distance_m, 1.0, 2000.0, "m")
         check_between("preview.reaction_s", self.reaction_s, 0.0, 10.0, "s")
-        check_between("preview.deceleration_mps2", self.deceleration_mps2, 0.5, 10.0, "m/s2")
+        check_between("preview.deceleration_m_s2", self.deceleration_m_s2, 0.5, 10.0, "m/s2")
 
-    def needed_m(self, speed_mps: float) -> float:
+    def needed_m(self, speed_m_s: float) -> float:
         """Preview distance at a speed. [m]"""
         if self.distance_m is not None:
             return self.distance_m
-        return max(CAMERA_PREVIEW_M, reaction_distance_m(speed_mps, self.reaction_s, self.deceleration_mps2))
+        return max(CAMERA_PREVIEW_M, reaction_distance_m(speed_m_s, self.reaction_s, self.deceleration_m_s2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class RadioPlan:
     sides: int = 2
     lane_width_m: float = LANE_WIDTH_M
     markers: RoadMarkers | None = None  # their positions
-    design_speed_mps: float = 13.4  # [m/s] 0.5 to 70
+    design_speed_m_s: float = 13.4  # [m/s] 0.5 to 70
     preview: PreviewRule = field(default_factory=PreviewRule)
     link: LinkModel = field(default_factory=LinkModel)
     receiver: Receiver = field(default_factory=Receiver)
@@ -101,7 +101,7 @@ class RadioPlan:
     min_battery_days: float = 365.0  # [day] 0 to 36,500
 
     def __post_init__(self) -> None:
-        check_between("design_speed_mps", self.design_speed_mps, 0.5, 70.0, "m/s")
+        check_between("design_speed_m_s", self.design_speed_m_s, 0.5, 70.0, "m/s")
         check_between("min_probability", self.min_probability, 0.5, 0.9999, "")
         check_between("min_battery_days", self.min_battery_days, 0.0, 36_500.0, "days")
         RoadMarkers.evenly(self.spacing_m, 0.0, sides=self.sides, lane_width_m=self.lane_width_m)
@@ -109,7 +109,7 @@ class RadioPlan:
     @property
     def preview_m(self) -> float:
         """Distance ahead at which a marker must have been read. [m]"""
-        return self.preview.needed_m(self.design_speed_mps)
+        return self.preview.needed_m(self.design_speed_m_s)
 
     @property
     def air(self) -> Air:
@@ -156,7 +156,7 @@ def check_radio(plan: RadioPlan) -> RadioCheck:
     air, preview_m = plan.air, plan.preview_m
     markers, wanted = markers_of(plan)
     approaches = [approach(markers, index, preview_m, air) for index in wanted]
-    probability = min(read_probability(one, plan.design_speed_mps, air) for one in approaches)
+    probability = min(read_probability(one, plan.design_speed_m_s, air) for one in approaches)
     success = min(_success_at_preview(one, air) for one in approaches)
     road = road_reception(markers, _stations(plan, markers), air)
     days = battery_life_days(plan.settings, plan.battery)
@@ -258,7 +258,7 @@ def _probability(plan: RadioPlan, probability: float, success: float, in_range: 
         plan.min_probability,
         "probability",
         "pure ALOHA with capture; preview by AASHTO section 3.2.2 and the CERPM paper, section 5",
-        f"that a marker is read before the vehicle is {plan.preview_m:.0f} m from it, at {plan.design_speed_mps:g} m/s "
+        f"that a marker is read before the vehicle is {plan.preview_m:.0f} m from it, at {plan.design_speed_m_s:g} m/s "
         f"with {in_range} markers in range; {success:.0%} of its packets are read there",
     )
 
@@ -343,7 +343,7 @@ def _best(plan: RadioPlan, approaches_by_link: _ApproachesByLink) -> Recommendat
         approaches = approaches_by_link.find(first)
         for settings in _intervals(first, plan) if approaches else ():
             air = Air(settings, plan.link, plan.receiver)
-            probability = min(read_probability(one, plan.design_speed_mps, air) for one in approaches)
+            probability = min(read_probability(one, plan.design_speed_m_s, air) for one in approaches)
             if likeliest is None or probability > likeliest[0]:
                 likeliest = probability, settings
             if probability >= plan.min_probability:

@@ -138,7 +138,7 @@ class Ahead(_Part):
 
     before: Literal["stopping_distance", "reaction_distance"] | float = "stopping_distance"
     reaction_s: float = Field(default=2.5, ge=0.0, le=10.0)
-    deceleration_mps2: float = Field(default=3.4, ge=0.5, le=10.0)
+    deceleration_m_s2: float = Field(default=3.4, ge=0.5, le=10.0)
     min_before_m: float = Field(default=20.0, ge=0.0, le=1000.0)
 
 

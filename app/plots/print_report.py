@@ -159,7 +159,7 @@ def _draw_table(page: _Page, parameters: Sequence[PrintParameter], y: float) -> 
 def _draw_prediction(page: _Page, report: PrintReport, y: float) -> float:
     found, design = report.prediction, report.design
     sure = "will be read" if found.will_be_read else "will not be read reliably"
-    page.text(_LEFT, y, f"At {design.speed_mps * 3.6:g} km/h the plate {sure}", 9.0, bold=True)
+    page.text(_LEFT, y, f"At {design.speed_m_s * 3.6:g} km/h the plate {sure}", 9.0, bold=True)
     text = (
         f"Camera {design.camera.name}, {design.camera.width_px} x {design.camera.height_px} px, "
         f"{design.camera.frames_per_s:g} frames/s: {found.readable_frames:.1f} readable frames a pass; predicted read "

@@ -393,14 +393,14 @@ def approach(markers: RoadMarkers, index: int, nearest_m: float, air: Air) -> Ap
     return Approach(ahead_m, level, harmful_others(level, other_levels, air.threshold_dbm, air.link, air.receiver))
 
 
-def read_probability(reception: Approach, speed_mps: float, air: Air) -> float:
+def read_probability(reception: Approach, speed_m_s: float, air: Air) -> float:
     """Probability that a marker is read at least once on the approach.
 
     Parameters
     ----------
     reception : Approach
         Down to the preview distance.
-    speed_mps : float
+    speed_m_s : float
         0.5 to 70. [m/s]
 
     Raises
@@ -413,11 +413,11 @@ def read_probability(reception: Approach, speed_mps: float, air: Air) -> float:
     The marker sends every interval from a random phase; the result is averaged over 32 phases. Packets are assumed to
     fade and collide independently; for collisions jitter makes this nearly true.
     """
-    check_between("design_speed_mps", speed_mps, 0.5, 70.0, "m/s")
+    check_between("design_speed_m_s", speed_m_s, 0.5, 70.0, "m/s")
     if len(reception.ahead_m) == 0:
         return 0.0
     success = packet_success(reception.level_dbm, reception.harmful, air.settings, air.link, air.receiver)
-    stride_m = speed_mps * air.settings.interval_s
+    stride_m = speed_m_s * air.settings.interval_s
     stretch_m = reception.ahead_m[-1] - reception.ahead_m[0]
     each = math.ceil(stretch_m / stride_m / _TRANSMISSIONS)  # transmissions that are taken as sent from one place
     count = math.ceil(stretch_m / (each * stride_m))

@@ -396,7 +396,7 @@ class SteeringCheck:
 
 def check_steering(
     path_enu_m: npt.ArrayLike,
-    speed_limit_km_h: npt.ArrayLike,
+    speed_limit_kmh: npt.ArrayLike,
     *,
     controller: Controller | str = Controller.PREDICTIVE,
     settings: SteeringSettings | None = None,
@@ -412,7 +412,7 @@ def check_steering(
     ----------
     path_enu_m : array_like, shape (S, 2)
         The path decoded: east, north in the direction of travel. [m]
-    speed_limit_km_h : float or array_like, shape (S,)
+    speed_limit_kmh : float or array_like, shape (S,)
         Driven at except in bends, which are driven at 2 m/s2 of lateral acceleration, with 1.5 m/s2 of braking before
         them. [km/h]
     settings : SteeringSettings, optional
@@ -453,7 +453,7 @@ def check_steering(
         raise InvalidParameter("the start is off the path", field="start_offset_m", limit=f"< {OFF_PATH_M:g} m")
     path = follow_path(path_enu_m)
     truth = path if truth_enu_m is None else follow_path(truth_enu_m, field="truth_enu_m")
-    speed = plan_speed(path, path_enu_m, speed_limit_km_h)
+    speed = plan_speed(path, path_enu_m, speed_limit_kmh)
     longest_s = _SPARE_SHARE * path.step_m * float(np.sum(1 / speed)) + _SPARE_S
     steps = math.ceil(longest_s / STEP_S)
     errors = draw_pose_errors(noise, steps, rng or np.random.default_rng(0))

@@ -200,10 +200,10 @@ class ReceiverResult:
     # `used`, `left_out`: positions
     used: int
     left_out: int
-    # `stated_m`, `believed_m`: [m] median of their stated standard deviations, both axes together, and what the markers
+    # `stated_m`, `assumed_m`: [m] median of their stated standard deviations, both axes together, and what the markers
     # show of it
     stated_m: float
-    believed_m: float
+    assumed_m: float
 
 
 @dataclass(frozen=True, slots=True)

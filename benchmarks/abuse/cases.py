@@ -74,14 +74,14 @@ def _documents(ids: dict[str, str], *, short: bool) -> Iterator[Case]:
     yield _json(where.format(**ids), "a thousand positions", positions, where)
     radio = {"interval_s": 0.05, "spreading_factor": 7, "bandwidth_hz": 500_000}
     receiver = {"sensitivity_dbm": -150.0}
-    slow = {"radio": radio, "receiver": receiver, "design_speed_mps": 0.5}
+    slow = {"radio": radio, "receiver": receiver, "design_speed_m_s": 0.5}
     yield _json("/v1/radio-checks", "short interval, slow, sensitive", slow)
     yield _json("/v1/radio-checks", "recommend, slow", slow | {"recommend": True})
     placed = {"chainage_m": [float(k) for k in range(5_000)], "offset_m": [1.8] * 5_000}
     yield _json("/v1/radio-checks", "5,000 markers", {"markers": placed, "recommend": True})
     for magnets in (4,) if short else (5, 6, 7):
         design = {"magnets": magnets, "length_m": 4.0, "segment_m": 0.05}
-        book = {"name": f"M{magnets}", "design": design, "rules": {"speed_mps": 13.4, "clearance_m": 0.3}}
+        book = {"name": f"M{magnets}", "design": design, "rules": {"speed_m_s": 13.4, "clearance_m": 0.3}}
         yield _json("/v1/codebooks", f"{magnets} magnets", book)
     formats = {"formats": ["pdf", "svg", "dxf", "png"], "resolution_dpi": 300}
     yield _json("/v1/artwork", "40 plates", formats | {"bbox": [9.9, 49.99, 11.0, 50.01]})

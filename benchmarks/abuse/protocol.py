@@ -114,7 +114,7 @@ def leave_pipelined(server: ObservedServer, short: bool) -> str:
     """Requests that take a second each, behind each other, by clients that leave at once."""
     key = server.client.headers["X-API-Key"]
     radio = {"interval_s": 0.05, "spreading_factor": 7, "bandwidth_hz": 500_000}
-    body = json.dumps({"radio": radio, "receiver": {"sensitivity_dbm": -150.0}, "design_speed_mps": 0.5})
+    body = json.dumps({"radio": radio, "receiver": {"sensitivity_dbm": -150.0}, "design_speed_m_s": 0.5})
     head = "POST /v1/radio-checks HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
     slow = f"{head}X-API-Key: {key}\r\nContent-Length: {len(body)}\r\n\r\n{body}".encode()
     clients, each = (2, 20) if short else (5, 200)

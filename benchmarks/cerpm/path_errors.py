@@ -25,7 +25,7 @@ class Tally:
     """Errors at true places every 0.25 m between the first and the last marker, over runs."""
 
     off_m: list[Floats] = field(default_factory=list)
-    curvature_1pm: list[Floats] = field(default_factory=list)
+    curvature_per_m: list[Floats] = field(default_factory=list)
     confidence: list[Floats] = field(default_factory=list)
     right: list[Floats] = field(default_factory=list)
     within_two_sigma: list[Floats] = field(default_factory=list)
@@ -36,7 +36,7 @@ class Tally:
 
     def add(self, other: Tally) -> None:
         """Add the runs of another tally."""
-        for name in ("off_m", "curvature_1pm", "confidence", "right", "within_two_sigma"):
+        for name in ("off_m", "curvature_per_m", "confidence", "right", "within_two_sigma"):
             getattr(self, name).extend(getattr(other, name))
         for name in ("covered", "places", "runs", "refused"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
@@ -52,9 +52,9 @@ class Tally:
         return max((float(o.max()) for o in self.off_m if len(o)), default=float("nan"))
 
     @property
-    def curvature_rms_1pm(self) -> float:
+    def curvature_rms_per_m(self) -> float:
         """[1/m]"""
-        return _rms(self.curvature_1pm)
+        return _rms(self.curvature_per_m)
 
     @property
     def coverage(self) -> float:
@@ -76,12 +76,12 @@ class Tally:
 class PlaceErrors(NamedTuple):
     """A path at true places every 0.25 m that are beside it."""
 
-    # `off_m`, `confidence`, `sigma_m`, `curvature_off_1pm`: shape (N,): distance of the true centre line from the path,
+    # `off_m`, `confidence`, `sigma_m`, `curvature_off_per_m`: shape (N,): distance of the true centre line from the path,
     # what the path reports there, and the error of its curvature
     off_m: Floats
     confidence: Floats
     sigma_m: Floats
-    curvature_off_1pm: Floats
+    curvature_off_per_m: Floats
     coverage: float  # share of all true places that a path covers
 
     @property
@@ -111,7 +111,7 @@ def place_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> P
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     confidence, sigma = np.interp(at, along, path.confidence), np.interp(at, along, path.sigma_m)
     covered = (off <= NEAR_M) & (~np.isfinite(confidence) | (confidence >= MIN_CONFIDENCE))
-    bend = np.interp(at, along, path.curvature_1pm) - lane.curvature_1pm[inside]
+    bend = np.interp(at, along, path.curvature_per_m) - lane.curvature_per_m[inside]
     share = float(covered.sum()) / max(int(inside.sum()), 1)
     return PlaceErrors(off[beside], confidence[beside], sigma[beside], bend[beside], share)
 
@@ -134,7 +134,7 @@ def path_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Ta
     reported = np.isfinite(found.confidence)
     tally.covered = round(found.coverage * places)
     tally.off_m.append(found.off_m)
-    tally.curvature_1pm.append(found.curvature_off_1pm)
+    tally.curvature_per_m.append(found.curvature_off_per_m)
     tally.confidence.append(found.confidence[reported])
     tally.right.append((found.off_m[reported] <= TOLERANCE_M).astype(float))
     tally.within_two_sigma.append((found.off_m <= 2 * found.sigma_m)[reported].astype(float))

@@ -53,7 +53,7 @@ CONDITIONS = (
     Condition("ten a side, markers alone", (0.13, None, None), 10, with_track=False),
     Condition("ten a side of at most 300 m, markers alone", (0.13, None, None), 10, with_track=False, longest_m=300.0),
 )
-CURVATURE_GOAL_1PM = 0.003
+CURVATURE_GOAL_PER_M = 0.003
 
 
 def _gap(markers: InstalledMarkers, rng: np.random.Generator) -> InstalledMarkers:
@@ -87,12 +87,12 @@ def run_path(seed: int, short: bool) -> Result:
         if number == 0:
             curvature = every
         rows.append(_path_row(condition, ours, every, paper, own))
-    got = curvature.curvature_rms_1pm
+    got = curvature.curvature_rms_per_m
     confidence, right = (100 * share for share in all_rows.confidence_and_share_right)
     note = (
         "RMS distance from the true centre line to the path [m], by lane; maximum and coverage over all lanes. Met: "
         "RMS on each route, and on the generated lanes together. Own track: the vehicle's positions used as path.\n\n"
-        f"Curvature at 40 ft: {got:.4f} 1/m RMS, goal {CURVATURE_GOAL_1PM}, met: {met(got <= CURVATURE_GOAL_1PM)}. "
+        f"Curvature at 40 ft: {got:.4f} 1/m RMS, goal {CURVATURE_GOAL_PER_M}, met: {met(got <= CURVATURE_GOAL_PER_M)}. "
         f"Over all rows the mean confidence (within 0.25 m of the centre) is {confidence:.1f} %; {right:.1f} % are."
     )
     head = (

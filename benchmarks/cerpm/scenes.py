@@ -86,7 +86,7 @@ def markers_for_lane(installed: InstalledMarkers) -> LaneMarkers:
 def markers_from_merged(merged: MergedMarkers) -> LaneMarkers:
     """What is left of a log when verified and merged."""
     return LaneMarkers(
-        merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_km_h
+        merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh
     )
 
 
@@ -113,7 +113,7 @@ def payload_of(packets: Iterable[ReceivedPacket]) -> set[bytes]:
 
 def long_lane(rng: np.random.Generator, length_m: float, rate_hz: float = 10.0) -> tuple[LaneMarkers, PoseTrack]:
     """Many kilometres of markers in pairs every 12.25 m, and a drive along them at 25 m/s."""
-    lane = make_lane(rng, length_m=length_m, max_curvature_1pm=0.01)
+    lane = make_lane(rng, length_m=length_m, max_curvature_per_m=0.01)
     every = slice(0, None, 49)
     both = np.concatenate([lane.left_m[every], lane.right_m[every]])
     lon, lat = lane.wgs84_from_enu(both + rng.normal(0, SURVEY_M, both.shape))

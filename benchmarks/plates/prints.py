@@ -17,7 +17,7 @@ from app.planning.rules import CameraRules
 from app.simulation.plate_face import Colour, PlateLook, draw_look
 from benchmarks.scenes.printed_plate import PrintFaults, Stain, photograph_print, printed_face
 
-SPEED_MPS = 60 / 3.6
+SPEED_M_S = 60 / 3.6
 PHOTO_PX = (2016, 1512)
 SIDE_PX = 950.0
 GEOMETRY = PlateGeometry()
@@ -133,7 +133,7 @@ def _record(kind: FaultKind, strength: float, rng: np.random.Generator, seed: in
         grade = grade_print(pixels, code=code, geometry=GEOMETRY)
     except PrintNotGraded as error:
         refusal = error.message
-    design = DesignSpeed(CameraRules(), SPEED_MPS)
+    design = DesignSpeed(CameraRules(), SPEED_M_S)
     found = read_passes(face, code, GEOMETRY, design, seed=seed + int(rng.integers(1 << 20)), passes=passes)
     return PrintRecord(kind, strength, grade, refusal, found)
 

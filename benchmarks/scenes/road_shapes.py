@@ -70,7 +70,7 @@ def lane_of_shape(shape: RoadShape) -> TrueLane:
         Its boundaries cross, as where a bend is tighter than half its width.
     """
     at = np.arange(0.0, shape.length_m + STEP_M / 2, STEP_M)
-    curvature = _curvature_1pm(shape, at)
+    curvature = _curvature_per_m(shape, at)
     turned = np.concatenate([[0.0], np.cumsum((curvature[1:] + curvature[:-1]) / 2 * STEP_M)])
     yaw = math.pi / 2 - math.radians(shape.heading_deg) + turned
     mid = (yaw[1:] + yaw[:-1]) / 2
@@ -86,7 +86,7 @@ def lane_of_shape(shape: RoadShape) -> TrueLane:
     return lane_between(centre + normal * left[:, None], centre + normal * right[:, None], MICHIGAN)
 
 
-def _curvature_1pm(shape: RoadShape, at_m: Floats) -> Floats:
+def _curvature_per_m(shape: RoadShape, at_m: Floats) -> Floats:
     """Positive to the left, linear along clothoids, shape (N,). [1/m]"""
     sign, start, knots = (1.0 if shape.turns_left else -1.0), shape.straight_m, [(0.0, 0.0)]
     for radius, turn in ((shape.radius_m, shape.turn_deg), (shape.second_radius_m, shape.second_turn_deg)):

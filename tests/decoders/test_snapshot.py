@@ -102,8 +102,8 @@ def test_every_family_feeds_its_decoder() -> None:
     assert [tag.text for tag in snapshot.tags(8.4, 49.0, 100.0)] == ["SNS_4_0.1_10-30"]
     cerpms = snapshot.registered_cerpms(8.4, 49.0, 100.0)
     assert sorted(cerpms) == [1, 2]
-    assert cerpms[1].speed_limit_km_h == pytest.approx(80.4672)
-    assert np.isnan(cerpms[2].speed_limit_km_h)
+    assert cerpms[1].speed_limit_kmh == pytest.approx(80.4672)
+    assert np.isnan(cerpms[2].speed_limit_kmh)
     found = snapshot.match_plate(rare, 8.4, 49.0, 100.0)
     assert found is not None
     assert (found.marker_id, found.kind["scheme"]) == (markers[1]["id"], PlateScheme.ID)

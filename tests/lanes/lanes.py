@@ -101,7 +101,7 @@ def moved(markers, k, by_m, lon=LON, lat=LAT):
     points = in_plane(markers.lon_deg, markers.lat_deg, lon, lat)
     points[k] += by_m
     lon_deg, lat_deg = on_globe(points, lon, lat)
-    return LaneMarkers(markers.number, lon_deg, lat_deg, markers.side, markers.sigma_m, markers.speed_limit_km_h)
+    return LaneMarkers(markers.number, lon_deg, lat_deg, markers.side, markers.sigma_m, markers.speed_limit_kmh)
 
 
 def drive(road, rng, *, wander=0.18, length=30.0, noise=0.02, offset=0.0, lon=LON, lat=LAT, accuracy=0.02):

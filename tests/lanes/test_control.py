@@ -109,7 +109,7 @@ def test_limits_hold_from_their_point_on():
 def test_speed_limits_that_make_no_sense_are_refused(limits):
     with pytest.raises(InvalidParameter) as caught:
         plan_speed(follow_path(EAST), EAST, limits)
-    assert caught.value.field == "speed_limit_km_h"
+    assert caught.value.field == "speed_limit_kmh"
 
 
 def test_equation_4_by_hand():

@@ -41,7 +41,7 @@ def test_heading_curvature_and_frames():
     at = np.interp(lane.station_m, [0, lane.station_m[-1]], [0, road.at[-1]])
     heading = 90 - np.degrees(np.interp(at, road.at, road.yaw))
     assert np.abs((lane.heading_deg - heading + 180) % 360 - 180).max() < 2.0
-    assert rms(lane.curvature_1pm - np.interp(at, road.at, road.curvature)) < 0.003
+    assert rms(lane.curvature_per_m - np.interp(at, road.at, road.curvature)) < 0.003
     assert np.array_equal(lane.position_enu_m, np.stack([lane.east_m, lane.north_m], 1))
     assert (lane.down_m == 0).all()
     step = np.hypot(*np.diff(lane.position_enu_m, axis=0).T)
@@ -109,7 +109,7 @@ def test_a_marker_that_names_the_wrong_side():
     side = markers.side.copy()
     side[4] = 3 - side[4]
     wrong = LaneMarkers(
-        markers.number, markers.lon_deg, markers.lat_deg, side, markers.sigma_m, markers.speed_limit_km_h
+        markers.number, markers.lon_deg, markers.lat_deg, side, markers.sigma_m, markers.speed_limit_kmh
     )
     for track in (drive(road, rng), None):
         lane = fit_lane(wrong, track)
@@ -123,7 +123,7 @@ def test_a_number_with_two_positions():
     number = markers.number.copy()
     number[3] = number[20]
     lane = fit_lane(
-        LaneMarkers(number, markers.lon_deg, markers.lat_deg, markers.side, markers.sigma_m, markers.speed_limit_km_h)
+        LaneMarkers(number, markers.lon_deg, markers.lat_deg, markers.side, markers.sigma_m, markers.speed_limit_kmh)
     )
     assert sorted(out.row for out in lane.left_out) == [3, 20]
     assert {out.reason for out in lane.left_out} == {LeftOutReason.TWO_PLACES}
@@ -182,9 +182,9 @@ def test_speed_limits_along_the_way():
     limit = np.tile(np.where(at < 55, 50.0, 30.0), 2)
     limit[2] = 40.0
     lane = fit_lane(LaneMarkers(markers.number, markers.lon_deg, markers.lat_deg, markers.side, markers.sigma_m, limit))
-    assert lane.speed_limit_km_h[[5, 20, 30, 40, 80]].tolist() == [50, 50, 40, 50, 30]
+    assert lane.speed_limit_kmh[[5, 20, 30, 40, 80]].tolist() == [50, 50, 40, 50, 30]
     assert any("speed limits" in warning for warning in lane.localization_warnings)
-    assert np.isnan(fit_lane(markers).speed_limit_km_h).all()
+    assert np.isnan(fit_lane(markers).speed_limit_kmh).all()
 
 
 def test_preview():

@@ -54,10 +54,10 @@ def test_what_is_no_place_is_named(method):
     markers = place(straight(), rng)
     lon, lat, sigma = markers.lon_deg.copy(), markers.lat_deg.copy(), markers.sigma_m.copy()
     lon[3], lat[5], lat[6], sigma[7:9] = np.nan, 95.0, np.inf, (np.nan, -1)
-    lane = fit_lane(LaneMarkers(markers.number, lon, lat, markers.side, sigma, markers.speed_limit_km_h), method=method)
+    lane = fit_lane(LaneMarkers(markers.number, lon, lat, markers.side, sigma, markers.speed_limit_kmh), method=method)
     assert lane.refusal is None
     assert [(out.row, out.reason) for out in lane.left_out] == [(k, LeftOutReason.NOT_A_PLACE) for k in (3, 5, 6)]
-    nothing = LaneMarkers(markers.number, lon * np.nan, lat, markers.side, sigma, markers.speed_limit_km_h)
+    nothing = LaneMarkers(markers.number, lon * np.nan, lat, markers.side, sigma, markers.speed_limit_kmh)
     refused = fit_lane(nothing, method=method)
     assert refused.refusal
     assert len(refused.left_out) == len(markers)

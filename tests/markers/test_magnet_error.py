@@ -26,8 +26,8 @@ MPS_30_MPH = 13.41
 ROUGH = ReadingConditions(20.0, 0.35, OdometerError(drift=0.01), MagnetErrorModel(timing_s=0.0005))
 
 
-def metro(speed_mps: float = MPS_30_MPH, clearance_m: float = 0.16) -> ReadingConditions:
-    return ReadingConditions(speed_mps, clearance_m, model=METRO_ERROR)
+def metro(speed_m_s: float = MPS_30_MPH, clearance_m: float = 0.16) -> ReadingConditions:
+    return ReadingConditions(speed_m_s, clearance_m, model=METRO_ERROR)
 
 
 # METRO figure 17b, 30 mph: accuracy over neighbouring tags, ten passes each
@@ -49,9 +49,9 @@ def read_tags(gaps_m: np.ndarray, at: ReadingConditions, count: int, scale: floa
     """Gaps of one tag as they are read, shape (count, M - 1)."""
     rng = np.random.default_rng(7)
     places = np.concatenate([[0.0], np.cumsum(gaps_m)])
-    std = at.model.position_std_m(at.speed_mps, at.clearance_m)
+    std = at.model.position_std_m(at.speed_m_s, at.clearance_m)
     places = places + rng.normal(0, std, (count, len(places)))
-    return scale * (np.diff(places) + rng.normal(0, at.odometer.gap_std_m(gaps_m, at.speed_mps), (count, len(gaps_m))))
+    return scale * (np.diff(places) + rng.normal(0, at.odometer.gap_std_m(gaps_m, at.speed_m_s), (count, len(gaps_m))))
 
 
 def normalised(gaps: np.ndarray) -> np.ndarray:
@@ -117,7 +117,7 @@ def test_every_difficulty_costs_codes() -> None:
         ReadingConditions(10.0, 0.40),
         ReadingConditions(60.0, 0.33),
         ReadingConditions(10.0, 0.16, OdometerError(drift=0.02)),
-        ReadingConditions(10.0, 0.16, OdometerError(quantum_mps=0.6)),
+        ReadingConditions(10.0, 0.16, OdometerError(quantum_m_s=0.6)),
         ReadingConditions(10.0, 0.16, model=MagnetErrorModel(placement_m=0.02)),
     ):
         assert distinguishable(design, hard).mean_accuracy < easy.mean_accuracy
@@ -159,8 +159,8 @@ def test_separation_is_a_probability_of_confusion() -> None:
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: ReadingConditions(speed_mps=0.0), "speed_mps"),
-        (lambda: ReadingConditions(speed_mps=math.nan), "speed_mps"),
+        (lambda: ReadingConditions(speed_m_s=0.0), "speed_m_s"),
+        (lambda: ReadingConditions(speed_m_s=math.nan), "speed_m_s"),
         (lambda: ReadingConditions(clearance_m=30.0), "clearance_m"),
         (lambda: OdometerError(rate_hz=0.0), "rate_hz"),
         (lambda: OdometerError(drift=-0.1), "drift"),
@@ -193,7 +193,7 @@ def test_the_odometer_errs_by_its_steps_and_by_its_drift() -> None:
     rng = np.random.default_rng(5)
     speeds = rng.uniform(9.0, 11.0, (100_000, 3))  # three speeds a gap of 3 m: 10 a second, in steps of 0.1 m/s
     errors = ((np.round(speeds / 0.1) * 0.1 - speeds) / 10.0).sum(axis=1)
-    steps = OdometerError(quantum_mps=0.1, drift=0.0)
+    steps = OdometerError(quantum_m_s=0.1, drift=0.0)
     assert steps.gap_std_m(np.array([3.0]), 10.0)[0] == pytest.approx(errors.std(), rel=0.02)
-    drift = OdometerError(quantum_mps=0.0, drift=0.01)
+    drift = OdometerError(quantum_m_s=0.0, drift=0.01)
     np.testing.assert_allclose(drift.gap_std_m(np.array([1.0, 3.0]), 10.0), [0.01, 0.03])

@@ -60,7 +60,7 @@ def opposite(lane: Lane, name: str) -> Lane:
     return Lane(
         name, lane.road, lane.chainage_m, lon[backwards], lat[backwards], lane.height_m[backwards],
         (lane.heading_deg[backwards] + 180.0) % 360.0, lane.curvature_per_m[backwards], -lane.grade[backwards],
-        -lane.superelevation_rad[backwards], lane.width_m, lane.design_speed_mps[backwards], lane.station_m[backwards],
+        -lane.superelevation_rad[backwards], lane.width_m, lane.design_speed_m_s[backwards], lane.station_m[backwards],
         lane.left_style, lane.right_style,
     )  # fmt: skip
 

@@ -38,7 +38,7 @@ def test_generated_roads_are_as_long_as_asked_and_their_lanes_run_both_ways() ->
 def test_real_lanes_are_read(name: str) -> None:
     (lane,) = real_lane(name).lanes
     assert lane.length_m > 200
-    assert lane.design_speed_mps.max() < 14
+    assert lane.design_speed_m_s.max() < 14
 
 
 def test_the_optimiser_is_as_cheap_as_trying_all_choices() -> None:

@@ -91,7 +91,7 @@ def test_kinks_and_vertices_millimetres_apart_leave_markers_on_the_polyline() ->
 def test_width_and_curvature_of_a_circle() -> None:
     lane = cut_lane(_arc(40, 1.5), _arc(40, -1.5))
     assert lane.width_m == pytest.approx(np.full(len(lane.width_m), 3.0), abs=2e-3)
-    inner = lane.curvature_1pm[20:-20]
+    inner = lane.curvature_per_m[20:-20]
     assert inner == pytest.approx(np.full(len(inner), 1 / 40), rel=0.02)
     assert np.hypot(lane.centre_m[:, 0], lane.centre_m[:, 1] - 40) == pytest.approx(
         np.full(len(lane.centre_m), 40.0), abs=2e-3

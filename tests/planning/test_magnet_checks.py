@@ -70,7 +70,7 @@ def test_the_reaction_distance_is_aashtos_stopping_sight_distance() -> None:
     assert far.figure == pytest.approx(limit + 0.1, abs=1e-4)
     assert checks_of(TAG, Site(13.41, 10.0))["reaction-distance"].figure == pytest.approx(-44.0, abs=1e-4)
     assert checks_of(TAG, Site(5.9, last + 20.0))["reaction-distance"].passed  # the paper's 20 m
-    assert checks_of(TAG, Site(13.41, last + 20.0, reaction_s=0.5, deceleration_mps2=8.0))["reaction-distance"].passed
+    assert checks_of(TAG, Site(13.41, last + 20.0, reaction_s=0.5, deceleration_m_s2=8.0))["reaction-distance"].passed
 
 
 def test_vehicles_are_served_up_to_the_readable_clearance() -> None:
@@ -115,14 +115,14 @@ def test_a_long_tag_on_a_sharp_bend_leaves_the_lane(bend: LaneLine) -> None:
 @pytest.mark.parametrize(
     ("options", "field"),
     [
-        ({"stop_line_chainage_m": 100.0}, "design_speed_mps"),
-        ({"design_speed_mps": math.nan}, "design_speed_mps"),
-        ({"design_speed_mps": 0.0}, "design_speed_mps"),
-        ({"design_speed_mps": 10.0, "stop_line_chainage_m": math.inf}, "stop_line_chainage_m"),
+        ({"stop_line_chainage_m": 100.0}, "design_speed_m_s"),
+        ({"design_speed_m_s": math.nan}, "design_speed_m_s"),
+        ({"design_speed_m_s": 0.0}, "design_speed_m_s"),
+        ({"design_speed_m_s": 10.0, "stop_line_chainage_m": math.inf}, "stop_line_chainage_m"),
         ({"vehicles": ("tank",)}, "vehicles"),
         ({"readable_clearance_m": 30.0}, "readable_clearance_m"),
         ({"reaction_s": -1.0}, "reaction_s"),
-        ({"deceleration_mps2": 0.0}, "deceleration_mps2"),
+        ({"deceleration_m_s2": 0.0}, "deceleration_m_s2"),
     ],
 )
 def test_a_site_outside_the_limits_is_refused_by_name(options: dict[str, object], field: str) -> None:

@@ -70,16 +70,16 @@ def test_an_even_road_is_checked_at_its_middle() -> None:
 def test_reading_in_time_is_harder_the_faster_the_denser_and_the_farther() -> None:
     plan = RadioPlan(RadioSettings(), preview=PreviewRule(31.0))
     base = check_radio(plan).read_probability
-    assert check_radio(replace(plan, design_speed_mps=25.0)).read_probability < base
+    assert check_radio(replace(plan, design_speed_m_s=25.0)).read_probability < base
     assert check_radio(replace(plan, spacing_m=6.0)).read_probability < base
     assert check_radio(replace(plan, preview=PreviewRule(60.0))).read_probability < base
     assert check_radio(replace(plan, sides=1)).read_probability > base
     assert check_radio(replace(plan, link=LinkModel(near_dbm=-118.0))).read_probability < base
 
 
-@pytest.mark.parametrize(("speed_mps", "preview_m"), [(3.0, 31.0), (13.4, 59.9), (30.0, 207.4)])
-def test_the_preview_is_the_stopping_distance_and_at_least_the_cameras(speed_mps: float, preview_m: float) -> None:
-    assert RadioPlan(RadioSettings(), design_speed_mps=speed_mps).preview_m == pytest.approx(preview_m, abs=0.1)
+@pytest.mark.parametrize(("speed_m_s", "preview_m"), [(3.0, 31.0), (13.4, 59.9), (30.0, 207.4)])
+def test_the_preview_is_the_stopping_distance_and_at_least_the_cameras(speed_m_s: float, preview_m: float) -> None:
+    assert RadioPlan(RadioSettings(), design_speed_m_s=speed_m_s).preview_m == pytest.approx(preview_m, abs=0.1)
 
 
 def test_channels_that_nobody_hears_are_warned_of() -> None:
@@ -114,8 +114,8 @@ def test_a_receiver_among_two_thousand_reads_nothing() -> None:
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        ({"design_speed_mps": 0.0}, "design_speed_mps"),
-        ({"design_speed_mps": float("nan")}, "design_speed_mps"),
+        ({"design_speed_m_s": 0.0}, "design_speed_m_s"),
+        ({"design_speed_m_s": float("nan")}, "design_speed_m_s"),
         ({"spacing_m": 0.5}, "spacing_m"),
         ({"sides": 0}, "sides"),
         ({"lane_width_m": 50.0}, "lane_width_m"),
@@ -133,7 +133,7 @@ def test_plans_outside_their_limits_are_refused(values: dict[str, float], field:
     ("make", "field"),
     [
         (lambda: PreviewRule(0.0), "preview.distance_m"),
-        (lambda: PreviewRule(deceleration_mps2=0.0), "preview.deceleration_mps2"),
+        (lambda: PreviewRule(deceleration_m_s2=0.0), "preview.deceleration_m_s2"),
         (lambda: Battery(capacity_mah=0.0), "battery.capacity_mah"),
         (lambda: Battery(usable_share=1.1), "battery.usable_share"),
         (lambda: Battery(sleep_ma=-1.0), "battery.sleep_ma"),

@@ -190,10 +190,10 @@ def test_channels_part_packets_and_a_receiver_hears_its_own_only() -> None:
 def test_a_lone_marker_is_read_when_it_sends_in_time() -> None:
     air = Air(RadioSettings(interval_s=2.0), STEADY, Receiver())
     markers = RoadMarkers([0.0], [1.8])
-    for nearest_m, speed_mps in ((31.0, 20.0), (100.0, 20.0), (100.0, 30.0)):
+    for nearest_m, speed_m_s in ((31.0, 20.0), (100.0, 20.0), (100.0, 30.0)):
         stretch_m = math.sqrt(air.range_m**2 - 1.8**2) - nearest_m
-        expected = min(1.0, stretch_m / (speed_mps * 2.0))
-        got = read_probability(approach(markers, 0, nearest_m, air), speed_mps, air)
+        expected = min(1.0, stretch_m / (speed_m_s * 2.0))
+        got = read_probability(approach(markers, 0, nearest_m, air), speed_m_s, air)
         assert got == pytest.approx(expected, abs=0.04)
 
 

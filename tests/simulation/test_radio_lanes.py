@@ -29,13 +29,13 @@ def test_a_made_lane_bends_as_its_curvature_says(lane: TrueLane) -> None:
     a, b, c = lane.centre_m[:-16], lane.centre_m[8:-8], lane.centre_m[16:]
     cross = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     sides = [np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))]
-    assert 2 * cross / np.prod(sides, axis=0) == pytest.approx(lane.curvature_1pm[8:-8], abs=6e-4)
-    assert np.abs(lane.curvature_1pm).max() > 0.008
+    assert 2 * cross / np.prod(sides, axis=0) == pytest.approx(lane.curvature_per_m[8:-8], abs=6e-4)
+    assert np.abs(lane.curvature_per_m).max() > 0.008
 
 
 def test_made_lanes_are_as_sharp_and_as_wide_as_asked() -> None:
     lanes = [make_lane(np.random.default_rng(1100 + k)) for k in range(20)]
-    sharpest = [np.abs(one.curvature_1pm).max() for one in lanes]
+    sharpest = [np.abs(one.curvature_per_m).max() for one in lanes]
     assert max(sharpest) <= 0.04
     assert max(sharpest) > 0.034
     widths = np.concatenate([one.width_m for one in lanes])
@@ -110,7 +110,7 @@ def test_a_driver_alone_scores_what_drivers_score() -> None:
 def test_a_driver_slows_down_for_bends(lane: TrueLane) -> None:
     drive = drive_lane(lane, Driver(speed_m_s=25), np.random.default_rng(1004))
     inside = (drive.chainage_m > 0) & (drive.chainage_m < lane.length_m)
-    curvature = np.abs(np.interp(drive.chainage_m[inside], lane.chainage_m, lane.curvature_1pm))
+    curvature = np.abs(np.interp(drive.chainage_m[inside], lane.chainage_m, lane.curvature_per_m))
     assert (drive.speed_m_s[inside] ** 2 * curvature).max() < 3.6
     moved = np.linalg.norm(np.diff(drive.point_m, axis=0), axis=1) / np.diff(drive.time_s)
     assert moved == pytest.approx(drive.speed_m_s[1:], rel=0.05)
@@ -154,7 +154,7 @@ def test_the_same_seed_is_the_same_drive(lane: TrueLane) -> None:
     assert (tracks[0].lon_deg == tracks[1].lon_deg).all()
 
 
-@pytest.mark.parametrize("how", [{"length_m": 10}, {"max_curvature_1pm": 0.5}, {"width_m": (3, 2)}])
+@pytest.mark.parametrize("how", [{"length_m": 10}, {"max_curvature_per_m": 0.5}, {"width_m": (3, 2)}])
 def test_lanes_that_cannot_be_are_refused(how: dict[str, object]) -> None:
     with pytest.raises(InvalidParameter):
         make_lane(np.random.default_rng(0), **how)  # type: ignore[arg-type]

@@ -40,7 +40,7 @@ def test_errors_of_a_path_at_a_known_distance(lane: TrueLane) -> None:
     assert (refused.coverage, refused.refused) == (0.0, 1)
 
 
-_ROWS = ("station_m", "position_enu_m", "lon_deg", "lat_deg", "curvature_1pm", "confidence", "sigma_m")
+_ROWS = ("station_m", "position_enu_m", "lon_deg", "lat_deg", "curvature_per_m", "confidence", "sigma_m")
 
 
 def test_paths_beat_the_drivers_own_track(lane: TrueLane) -> None:

@@ -104,11 +104,11 @@ def test_bends_are_stable(radius_m):
         assert check.max_m < (0.05 if law is Controller.PREDICTIVE else 0.35)
 
 
-@pytest.mark.parametrize("speed_km_h", [60.0, 100.0, 130.0])
-def test_an_offset_dies_out_at_any_speed(speed_km_h):
+@pytest.mark.parametrize("speed_kmh", [60.0, 100.0, 130.0])
+def test_an_offset_dies_out_at_any_speed(speed_kmh):
     path = np.column_stack([np.arange(0.0, 800.0), np.zeros(800)])
     for offset_m in (0.5, -0.5):
-        check = check_steering(path, speed_km_h, start_offset_m=offset_m)
+        check = check_steering(path, speed_kmh, start_offset_m=offset_m)
         assert check.completed
         assert check.trace.path_error_m[0] == pytest.approx(offset_m)
         assert np.abs(check.trace.path_error_m[400:]).max() < 0.02
@@ -213,11 +213,11 @@ def test_same_seed_same_drive_and_noise_is_as_stated():
         ({"truth_enu_m": EAST[:3]}, "truth_enu_m"),
         ({"path_enu_m": EAST[:3]}, "path_enu_m"),
         ({"path_enu_m": np.where(EAST == 7, np.nan, EAST)}, "path_enu_m"),
-        ({"speed_limit_km_h": math.nan}, "speed_limit_km_h"),
+        ({"speed_limit_kmh": math.nan}, "speed_limit_kmh"),
     ],
 )
 def test_bad_input_is_refused_by_name(arguments, field):
-    given = {"path_enu_m": EAST, "speed_limit_km_h": 40.0} | arguments
+    given = {"path_enu_m": EAST, "speed_limit_kmh": 40.0} | arguments
     with pytest.raises(InvalidParameter) as caught:
         check_steering(**given)
     assert caught.value.field == field

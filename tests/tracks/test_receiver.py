@@ -58,7 +58,7 @@ def test_positions_bridge_an_outage_and_leave_the_rest_as_it_is() -> None:
     (receiver,) = both.receivers
     assert (receiver.used, receiver.left_out) == (48, 0)
     assert receiver.stated_m == pytest.approx(0.1 * math.sqrt(2))
-    assert receiver.believed_m == receiver.stated_m
+    assert receiver.assumed_m == receiver.stated_m
     clock = next(clock for clock in both.clocks if clock.clock == "receiver")
     assert abs(clock.offset_s - 0.2) < 4 * clock.sigma_s < 0.4
     assert {result.fix.marker_id for result in both.fixes} == {fix.marker_id for fix in given.fixes}
@@ -76,7 +76,7 @@ def test_a_biased_receiver_does_not_spoil_the_track_where_markers_are(sigma_m: f
     assert errors_m(truth, both, 185, 235) < 1.2 * errors_m(truth, alone, 185, 235) + 0.01
     assert errors_m(truth, both, 60, 180) < 1.2 * max(errors_m(truth, alone, 60, 180), 1.2 * bias_m)
     (receiver,) = both.receivers
-    assert receiver.believed_m > 0.5 * bias_m
+    assert receiver.assumed_m > 0.5 * bias_m
 
 
 def test_a_jump_of_the_receiver_is_left_out() -> None:
@@ -88,7 +88,7 @@ def test_a_jump_of_the_receiver_is_left_out() -> None:
     track = estimate_track(replace(given, fixes=(*given.fixes, *mixed)))
     (receiver,) = track.receivers
     assert receiver.left_out == 4
-    assert receiver.believed_m == receiver.stated_m
+    assert receiver.assumed_m == receiver.stated_m
     assert errors_m(truth, track, 80, 160) < 1.0
 
 

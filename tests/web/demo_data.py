@@ -35,7 +35,7 @@ def fill(client: httpx.Client) -> dict[str, str]:
     tag = _made(client, "/v1/markers", {
         "family": "magnet", "status": "surveyed", "road": ROAD, "lane": lane,
         "tag": {"code": entry["code"], "codebook_id": book["id"], "chainage_m": 60},
-        "site": {"design_speed_mps": 13.4, "stop_line_chainage_m": 120},
+        "site": {"design_speed_m_s": 13.4, "stop_line_chainage_m": 120},
     })  # fmt: skip
     cerpms = [_made(client, "/v1/markers", _cerpm(k)) for k in range(CERPMS)]
     profile = {"camera": {"height_m": 1.4, "horizontal_fov_deg": 70}, "trace": {}}

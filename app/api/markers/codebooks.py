@@ -58,7 +58,7 @@ class DesignIn(StrictModel):
 class OdometerIn(StrictModel):
     """Errors of the vehicle's speed that do not cancel in a ratio."""
 
-    quantum_mps: Number = Field(0.01, ge=0, le=5, description="Step of the speed signal. [m/s]")
+    quantum_m_s: Number = Field(0.01, ge=0, le=5, description="Step of the speed signal. [m/s]")
     rate_hz: Number = Field(10.0, ge=0.1, le=1000, description="Speeds a second. [Hz]")
     drift: Number = Field(0.001, ge=0, le=0.1, description="Relative change of scale from one gap to the next.")
 
@@ -66,7 +66,7 @@ class OdometerIn(StrictModel):
 class RulesIn(StrictModel):
     """How far apart codes are kept: for the fastest and highest vehicle to be served."""
 
-    speed_mps: Number = Field(13.4, description="Speed at which codes must be read, 0.5 to 70. [m/s]")
+    speed_m_s: Number = Field(13.4, description="Speed at which codes must be read, 0.5 to 70. [m/s]")
     clearance_m: Number = Field(0.30, description="Clearance at which codes must be read, 0.05 to 1. [m]")
     odometer: OdometerIn = Field(default_factory=lambda: OdometerIn())
     confusion: Number = Field(
@@ -81,7 +81,7 @@ class RulesIn(StrictModel):
         """The rules as the core knows them."""
         with naming("rules"):
             odometer = OdometerError(**self.odometer.model_dump())
-            conditions = ReadingConditions(self.speed_mps, self.clearance_m, odometer)
+            conditions = ReadingConditions(self.speed_m_s, self.clearance_m, odometer)
             return CodebookRules(conditions, self.confusion, self.wrong_way_safe, self.survive_missing)
 
 
@@ -101,7 +101,7 @@ class CodebookIn(StrictModel):
                 {
                     "name": "City streets",
                     "design": {"magnets": 3, "length_m": 4.0, "segment_m": 0.1},
-                    "rules": {"speed_mps": 13.4, "clearance_m": 0.3, "wrong_way_safe": True},
+                    "rules": {"speed_m_s": 13.4, "clearance_m": 0.3, "wrong_way_safe": True},
                     "meanings": _MEANINGS_EXAMPLE,
                 }
             ]

@@ -20,7 +20,7 @@ from app.services.plans.documents import RadioCheckDocument, check_plan
 router = Router("/v1/radio-checks", "cerpms")
 
 _EXAMPLES: list[JsonValue] = [
-    {"radio": {"spreading_factor": 7, "bandwidth_hz": 500_000, "interval_s": 2.0}, "design_speed_mps": 13.4},
+    {"radio": {"spreading_factor": 7, "bandwidth_hz": 500_000, "interval_s": 2.0}, "design_speed_m_s": 13.4},
     {
         "region": "EU868",
         "radio": {"frequency_hz": 868_300_000, "bandwidth_hz": 125_000, "interval_s": 10.0, "power_dbm": 11.0},
@@ -52,7 +52,7 @@ class PreviewIn(StrictModel):
 
     distance_m: Number | None = Field(None, description="Fixed, 1 to 2,000. [m]")
     reaction_s: Number = Field(2.5, description="0 to 10. [s]")
-    deceleration_mps2: Number = Field(3.4, description="0.5 to 10. [m/s2]")
+    deceleration_m_s2: Number = Field(3.4, description="0.5 to 10. [m/s2]")
 
 
 class ReceiverIn(StrictModel):
@@ -80,7 +80,7 @@ class RadioCheckIn(StrictModel):
     region: Region = Region.US915
     road: EvenRoadIn = Field(default_factory=lambda: EvenRoadIn())
     markers: PlacedMarkersIn | None = Field(None, description="In place of `road`: where each is.")
-    design_speed_mps: Number = Field(13.4, description="0.5 to 70. [m/s]")
+    design_speed_m_s: Number = Field(13.4, description="0.5 to 70. [m/s]")
     preview: PreviewIn = Field(default_factory=lambda: PreviewIn())
     receiver: ReceiverIn = Field(default_factory=lambda: ReceiverIn())
     battery: BatteryIn = Field(default_factory=lambda: BatteryIn())
@@ -102,7 +102,7 @@ class RadioCheckIn(StrictModel):
             self.region,
             **self.road.model_dump(),
             markers=markers,
-            design_speed_mps=self.design_speed_mps,
+            design_speed_m_s=self.design_speed_m_s,
             preview=PreviewRule(**self.preview.model_dump()),
             receiver=receiver,
             battery=battery,

@@ -118,7 +118,7 @@ class RegisteredMarker:
     lat_deg: float
     height_m: float | None = None  # [m] above the ellipsoid
     side: LaneSide = LaneSide.UNKNOWN
-    speed_limit_km_h: float = math.nan  # [km/h] NaN where none is posted
+    speed_limit_kmh: float = math.nan  # [km/h] NaN where none is posted
     sigma_m: float = math.nan  # [m] standard deviation of its survey on each axis; NaN if unknown
 
 
@@ -159,9 +159,9 @@ class MergedMarkers:
     lon_deg: Floats
     lat_deg: Floats
     side: npt.NDArray[np.int64]  # shape (K,): `LaneSide` values
-    # `sigma_m`, `speed_limit_km_h`: shape (K,): [m, km/h]
+    # `sigma_m`, `speed_limit_kmh`: shape (K,): [m, km/h]
     sigma_m: Floats
-    speed_limit_km_h: Floats
+    speed_limit_kmh: Floats
     packets: npt.NDArray[np.int64]  # shape (K,): accepted ones
     registered: npt.NDArray[np.bool_]  # shape (K,)
     left_out: dict[int, str]  # markers without a row, with the reason
@@ -448,7 +448,7 @@ def _rows(
         lat_deg=places[:, 1],
         side=np.array([_side(c) for c in used], np.int64),
         sigma_m=np.array([_sigma_m(c.known) for c in used], float),
-        speed_limit_km_h=np.array([_speed_limit_km_h(c) for c in used], float),
+        speed_limit_kmh=np.array([_speed_limit_kmh(c) for c in used], float),
         packets=np.array([len(c.accepted) for c in used], np.int64),
         registered=np.array([c.known is not None for c in used], bool),
         left_out=left_out,
@@ -463,9 +463,9 @@ def _side(candidate: _Candidate) -> int:
     return int(candidate.newest.side if known is None or known.side is LaneSide.UNKNOWN else known.side)
 
 
-def _speed_limit_km_h(candidate: _Candidate) -> float:
-    if candidate.known is not None and math.isfinite(candidate.known.speed_limit_km_h):
-        return candidate.known.speed_limit_km_h
+def _speed_limit_kmh(candidate: _Candidate) -> float:
+    if candidate.known is not None and math.isfinite(candidate.known.speed_limit_kmh):
+        return candidate.known.speed_limit_kmh
     limit = candidate.newest.speed_limit
     return math.nan if limit is None else limit.km_h
 
@@ -562,7 +562,7 @@ def _without_retired(merged: MergedMarkers, retired: frozenset[int]) -> MergedMa
     if not named:
         return merged
     kept = ~np.isin(merged.number, named)
-    arrays = ("number", "lon_deg", "lat_deg", "side", "sigma_m", "speed_limit_km_h", "packets", "registered")
+    arrays = ("number", "lon_deg", "lat_deg", "side", "sigma_m", "speed_limit_kmh", "packets", "registered")
     return replace(
         merged,
         **{name: getattr(merged, name)[kept] for name in arrays},

@@ -144,7 +144,7 @@ def _full(book: Codebook, asked: int, fit: int, rules: CodebookRules) -> Codeboo
         if on
     ]
     rule = ", ".join(
-        (f"confusion at most {rules.confusion:g} at {at.speed_mps:g} m/s and {at.clearance_m:g} m clearance", *extra)
+        (f"confusion at most {rules.confusion:g} at {at.speed_m_s:g} m/s and {at.clearance_m:g} m clearance", *extra)
     )
     return CodebookFull(
         f"{asked} codes were asked for, {fit} more fit beside the {len(book.entries)} in the book",

@@ -353,14 +353,14 @@ class LineIn(StrictModel):
 class SiteIn(StrictModel):
     """What the checks need to know of the road and its traffic."""
 
-    design_speed_mps: Number | None = Field(None, description="Design speed, 0.5 to 70. [m/s]")
+    design_speed_m_s: Number | None = Field(None, description="Design speed, 0.5 to 70. [m/s]")
     stop_line_chainage_m: Number | None = Field(None, description="Of the stop line that the tag announces. [m]")
     vehicles: list[Text] = Field(
         ["sedan", "utility"], max_length=8, description="Vehicles to be served: sedan, utility, van, heavy truck."
     )
     readable_clearance_m: Number = Field(0.30, description="Clearance up to which vehicles read, 0.05 to 1. [m]")
     reaction_s: Number = Field(2.5, description="Reaction time of the driver or the system, 0 to 10. [s]")
-    deceleration_mps2: Number = Field(3.4, description="Comfortable deceleration, 0.5 to 10. [m/s2]")
+    deceleration_m_s2: Number = Field(3.4, description="Comfortable deceleration, 0.5 to 10. [m/s2]")
 
 
 _LANE_EXAMPLE: dict[str, JsonValue] = {
@@ -374,7 +374,7 @@ MAGNET_EXAMPLES: list[JsonValue] = [
         "family": "magnet",
         "lane": _LANE_EXAMPLE,
         "tag": {"code": "SNS_4_0.1_10-30", "chainage_m": 60.0},
-        "site": {"design_speed_mps": 13.4, "stop_line_chainage_m": 130.0},
+        "site": {"design_speed_m_s": 13.4, "stop_line_chainage_m": 130.0},
         "road": "Farm Lane",
     },
     {

@@ -61,12 +61,12 @@ class StoredLane(TypedDict):
 class SiteDocument(TypedDict):
     """What the checks know of the road and its traffic."""
 
-    design_speed_mps: float | None
+    design_speed_m_s: float | None
     stop_line_chainage_m: float | None
     vehicles: list[str]
     readable_clearance_m: float
     reaction_s: float
-    deceleration_mps2: float
+    deceleration_m_s2: float
 
 
 class StoredNeighbour(TypedDict):

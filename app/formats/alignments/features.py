@@ -102,7 +102,7 @@ class RoadFeature:
             )
         return value
 
-    def speed_limit_mps(self) -> float:
+    def speed_limit_m_s(self) -> float:
         """Speed limit; NaN without one. [m/s]
 
         Raises
@@ -525,7 +525,7 @@ def _lane(
         values, styles = left, (left.style("style", "left_style"), right.style("style", "right_style"))
         speed = left.speed if left.speed is not None else right.constant_speed(len(left.line))
         return LaneGeometry(
-            name, None, left.line, right.line, speed_limit_mps=speed, left_style=styles[0], right_style=styles[1],
+            name, None, left.line, right.line, speed_limit_m_s=speed, left_style=styles[0], right_style=styles[1],
             road=road,
         )  # fmt: skip
     if "centre" not in sides:
@@ -542,7 +542,7 @@ def _lane(
         values.line,
         curvature_per_m=values.curvature,
         width_m=values.width,
-        speed_limit_mps=values.speed,
+        speed_limit_m_s=values.speed,
         left_style=values.style("left_style"),
         right_style=values.style("right_style"),
         road=road,
@@ -598,7 +598,7 @@ def _join(name: str, features: Sequence[RoadFeature], frame: Frame, notes: list[
         return join_chain([np.full(len(part), number) for part, number in zip(parts, each, strict=True)], chain)
 
     line, curvature = join_chain(parts, chain), owners[0].curvature_per_m if len(parts) == 1 else None
-    speed, width = along(RoadFeature.speed_limit_mps), along(_width)
+    speed, width = along(RoadFeature.speed_limit_m_s), along(_width)
     ways = {(feature.text("oneway") or "yes").lower() for feature in features}
     if ways & set(_TWO_WAY):
         notes.append(f"lane {name} is driven in both directions; it is planned for the direction in which it is drawn")
@@ -650,7 +650,7 @@ def _event_value(feature: RoadFeature, kind: EventKind) -> float | str | None:
         return None
     value = feature.number("value")
     if value is None:
-        speed = feature.speed_limit_mps()
+        speed = feature.speed_limit_m_s()
         value = None if math.isnan(speed) else speed * 3.6
     if value is None or not SPEEDS_KMH[0] <= value <= SPEEDS_KMH[1]:
         raise _wrong(feature, "value", f"the speed limit is {value}", f"{SPEEDS_KMH[0]:g} to {SPEEDS_KMH[1]:g} km/h")

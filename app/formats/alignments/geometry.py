@@ -67,7 +67,7 @@ class LaneGeometry:
     # shape (N,), or None: [rad] positive falls to the right in the direction of travel
     superelevation_rad: Floats | None = None
     width_m: Floats | None = None  # shape (N,), or None [m]
-    speed_limit_mps: Floats | None = None  # shape (N,), or None: [m/s] NaN where none is given
+    speed_limit_m_s: Floats | None = None  # shape (N,), or None: [m/s] NaN where none is given
     # shape (N,), or None: [m] along the road's reference line, in its direction; decreases along a lane of the opposite
     # direction
     station_m: Floats | None = None

@@ -189,7 +189,7 @@ _UNPAINTED = frozenset({"virtual", "curbstone", "road_border", "guard_rail", "wa
 _STYLES = {"solid": BoundaryStyle.SOLID, "dashed": BoundaryStyle.DASHED}
 _SPEED = re.compile(r"(?P<value>\d+(\.\d+)?)\s*(?P<unit>km/h|kmh|kph|mph|m/s|mps)?", re.IGNORECASE)
 _SPEED_SIGN = re.compile(r"de274[-_.](?P<value>\d+)", re.IGNORECASE)
-_UNITS_MPS = {"m/s": 1.0, "mps": 1.0, "mph": 0.44704}
+_UNITS_M_S = {"m/s": 1.0, "mps": 1.0, "mph": 0.44704}
 _KMH = 1 / 3.6
 _REACH_M = 1.0
 """A stop line this near to the end of a lane is its stop line, one this near to its start is not. [m] Nodes of stop
@@ -213,7 +213,7 @@ class _Lanelet:
     left_turned: bool
     right_turned: bool
     tags: dict[str, str]
-    speed_mps: float
+    speed_m_s: float
 
     @property
     def left_nodes(self) -> tuple[str, ...]:
@@ -359,8 +359,8 @@ def _lane(osm: OsmMap, chain: list[_Lanelet], warnings: list[str]) -> LaneGeomet
     left = [*chain[0].left_nodes[:1], *(node for one in chain for node in one.left_nodes[1:])]
     right = [*chain[0].right_nodes[:1], *(node for one in chain for node in one.right_nodes[1:])]
     # A vertex between two lanelets has the limit of the second.
-    speeds = [one.speed_mps for one in chain for _ in one.left_nodes[1:]]
-    speed = np.array([*speeds, chain[-1].speed_mps])
+    speeds = [one.speed_m_s for one in chain for _ in one.left_nodes[1:]]
+    speed = np.array([*speeds, chain[-1].speed_m_s])
     rows = osm.rows(tuple(left)), osm.rows(tuple(right))
     parts = np.column_stack([osm.points[rows[0]], speed]), osm.points[rows[1]]
     meets = left[0] == right[0], left[-1] == right[-1]
@@ -383,7 +383,7 @@ def _lane(osm: OsmMap, chain: list[_Lanelet], warnings: list[str]) -> LaneGeomet
         name=f"lanelet {chain[0].id}",
         left=left_part[:, :3],
         right=right_part,
-        speed_limit_mps=None if np.isnan(speed).all() else speed,
+        speed_limit_m_s=None if np.isnan(speed).all() else speed,
         left_style=_style(osm, [(one.left, one.left_turned, True) for one in chain]),
         right_style=_style(osm, [(one.right, one.right_turned, False) for one in chain]),
     )
@@ -434,7 +434,7 @@ def _speed_limit(osm: OsmMap, lanelet: Relation, warnings: list[str]) -> float:
             signs = [osm.ways[sign].tags.get("subtype", "") for sign in rule.ways("refers") if sign in osm.ways]
             texts += [rule.tags[key] for key in ("sign_type", "speed_limit", "max_speed") if rule.tags.get(key)] + signs
     for text in texts:
-        value = _speed_mps(text)
+        value = _speed_m_s(text)
         if value is not None:
             return value
     if texts:
@@ -442,14 +442,14 @@ def _speed_limit(osm: OsmMap, lanelet: Relation, warnings: list[str]) -> float:
     return math.nan
 
 
-def _speed_mps(text: str) -> float | None:
+def _speed_m_s(text: str) -> float | None:
     """``50``, ``50 km/h``, ``30 mph``, ``13.9 m/s`` or ``de274-50``; kilometres per hour without a unit."""
     sign, plain = _SPEED_SIGN.fullmatch(text), _SPEED.fullmatch(text)
     if sign is not None:
         return float(sign["value"][:4]) * _KMH or None
     if plain is None or len(plain["value"]) > 8:
         return None
-    return float(plain["value"]) * _UNITS_MPS.get((plain["unit"] or "").lower(), _KMH) or None
+    return float(plain["value"]) * _UNITS_M_S.get((plain["unit"] or "").lower(), _KMH) or None
 
 
 def _crossings(osm: OsmMap) -> list[list[int]]:

@@ -261,7 +261,7 @@ def _lanes(road: RegisteredRoad, axes: list[Floats], chainages: list[Floats]) ->
                     f"{where}{name} {k + 1}",
                     centre=np.column_stack([line, np.full(len(line), np.nan)]),
                     width_m=np.full(len(line), lanes.width_m),
-                    speed_limit_mps=np.full(len(line), lanes.speed_limit_kmh / 3.6),
+                    speed_limit_m_s=np.full(len(line), lanes.speed_limit_kmh / 3.6),
                     station_m=chainage[::step],
                     left_style=styles[0],
                     right_style=styles[1],

@@ -49,7 +49,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
         "utc_time", "time_utc", "timestamp_ms", "time_ms", "unix_time",
     ),
     "side": ("side", "lane_side", "lane"),
-    "speed_km_h": ("speed_limit_km_h", "speed_limit_kmh", "speed_limit_kph"),
+    "speed_kmh": ("speed_limit_kmh", "speed_limit_km_h", "speed_limit_kph"),
     "speed_mph": ("speed_limit_mph",),
     "speed": ("speed_limit", "speedlimit"),
     "speed_unit": ("speed_limit_unit", "speed_unit"),
@@ -228,7 +228,7 @@ def _side(value: object) -> LaneSide:
 def _speed_limit(values: Mapping[str, object], decimal: str) -> SpeedLimit | None:
     named = str(values.get("speed_unit") or "").strip().lower()
     for name, unit in (
-        ("speed_km_h", SpeedUnit.KM_H),
+        ("speed_kmh", SpeedUnit.KM_H),
         ("speed_mph", SpeedUnit.MPH),
         ("speed", SpeedUnit.MPH if named == "mph" else SpeedUnit.KM_H if named in ("km/h", "kmh", "kph") else None),
     ):
@@ -279,7 +279,7 @@ class PacketDeclaration:
 
     clock: LogClock = field(default_factory=LogClock)
     # names of columns in place of the usual ones, by quantity: payload, number, lon, lat, height, rssi, snr, time,
-    # side, speed_km_h, speed_mph, device, event, crs
+    # side, speed_kmh, speed_mph, device, event, crs
     columns: Mapping[str, str] = field(default_factory=dict)
     payload_text: PayloadText = PayloadText.AUTO  # how the payload column is written; `auto` takes what gives 24 bytes
 

@@ -513,7 +513,7 @@ def plate_fixes(rules: PlanRules, lane: Lane, at: Floats) -> tuple[Floats, Float
     assert rules.plates is not None
     size, terms = rules.plates, rules.predictions
     geometry = PlateGeometry(size.n, size.unit_mm, size.gap_mm, size.thickness_mm)
-    speeds = lane.value_at(lane.design_speed_mps, at)
+    speeds = lane.value_at(lane.design_speed_m_s, at)
     offsets = np.full(len(at), size.offset_from_centre_m)
     rates = [
         plate_rates(offsets, speeds, geometry, camera, condition, terms)

@@ -195,7 +195,7 @@ def refine_breaks(
 def speed_kmh(lane: Lane, first_m: float, last_m: float) -> float | None:
     """Lowest design speed of a stretch, to a tenth; None if it is unknown. [km/h]"""
     low, high = np.searchsorted(lane.chainage_m, [first_m + 1e-6, last_m - 1e-6])
-    lowest = float(lane.design_speed_mps[max(int(low) - 1, 0) : int(high) + 1].min())
+    lowest = float(lane.design_speed_m_s[max(int(low) - 1, 0) : int(high) + 1].min())
     return round(lowest * 3.6, 1) if math.isfinite(lowest) else None
 
 

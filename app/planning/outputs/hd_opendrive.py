@@ -103,9 +103,9 @@ class ReferenceLine:
 
     def speeds_kmh(self) -> list[tuple[float, float]]:
         """s from which a design speed holds, and the speed; none where a part of the lane has none. [m, km/h]"""
-        if not np.isfinite(self.lane.design_speed_mps).all():
+        if not np.isfinite(self.lane.design_speed_m_s).all():
             return []  # a speed of OpenDRIVE holds until the next one
-        speed = np.round(self.lane.design_speed_mps * 3.6)
+        speed = np.round(self.lane.design_speed_m_s * 3.6)
         first = np.flatnonzero(np.concatenate([[True], np.diff(speed) != 0]))
         return list(zip(self._s[first].tolist(), speed[first].tolist(), strict=True))
 

@@ -347,7 +347,7 @@ class Package:
 
     def _sheets(self, layout: MagnetLayout, marker: PlannedMarker) -> Iterator[tuple[str, bytes]]:
         lane = self.plan.alignment.lane(marker.lane)
-        site = Site(design_speed_mps=float(lane.value_at(lane.design_speed_mps, marker.chainage_m)))
+        site = Site(design_speed_m_s=float(lane.value_at(lane.design_speed_m_s, marker.chainage_m)))
         sheet = replace(drilling_sheet(layout, site), holes=self._holes)
         for form in (SheetFormat.PDF, SheetFormat.CSV):
             yield f"drilling/{layout.name}.{form}", write_sheet(sheet, form)

@@ -57,7 +57,7 @@ _Array = Annotated[Any, BeforeValidator(_read_array), PlainSerializer(_write_arr
 """An array of float64, shape (N,)."""
 _LANE_ARRAYS = (
     "chainage_m", "lon_deg", "lat_deg", "height_m", "heading_deg", "curvature_per_m", "grade", "superelevation_rad",
-    "width_m", "design_speed_mps", "station_m",
+    "width_m", "design_speed_m_s", "station_m",
 )  # fmt: skip
 
 

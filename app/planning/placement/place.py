@@ -321,7 +321,7 @@ def _chosen_lanes(alignment: Alignment, rules: PlanRules) -> list[Lane]:
 def _check_applies(lanes: Sequence[Lane], rules: PlanRules) -> None:
     low, high = rules.applies.speed_kmh
     for lane in lanes:
-        for speed, at in zip((lane.design_speed_mps.min(), lane.design_speed_mps.max()), ("low", "high"), strict=True):
+        for speed, at in zip((lane.design_speed_m_s.min(), lane.design_speed_m_s.max()), ("low", "high"), strict=True):
             if not low - 1e-6 <= speed * _KMH <= high + 1e-6:
                 raise InvalidParameter(
                     f"the design speed of lane {lane.name} is {speed * _KMH:.0f} km/h, too {at} for these rules",
@@ -500,7 +500,7 @@ def _planned_tag(lane: Lane, site: Site, codes: Mapping[Meaning, InformationTag]
 
 
 def _speed_limit(lane: Lane, chainage_m: float) -> SpeedLimit:
-    speed_kmh = float(lane.value_at(lane.design_speed_mps, chainage_m)) * _KMH
+    speed_kmh = float(lane.value_at(lane.design_speed_m_s, chainage_m)) * _KMH
     return SpeedLimit(round(min(speed_kmh, MAX_SPEED_LIMIT)))
 
 

@@ -24,7 +24,7 @@ from app.planning.rules import Ahead, AvoidRules, LineRules, PlanRules, PlateRul
 # === Places on lanes before codes are assigned, and the distances ahead of events at which they are.
 
 
-GRAVITY_MPS2 = 9.81  # [m/s2] source: the stopping distance on a grade, AASHTO Green Book (2018), equation 3-3
+GRAVITY_M_S2 = 9.81  # [m/s2] source: the stopping distance on a grade, AASHTO Green Book (2018), equation 3-3
 _APPROACH_M = 300.0  # [m] before an event, whose highest design speed counts; above the stopping
 # distance at 130 km/h
 
@@ -52,14 +52,14 @@ def distance_ahead_m(lane: Lane, event_m: float, rule: Ahead) -> float:
     equations 3-2 and 3-3. Reaction distance: v t. The highest design speed of the 300 m before the event counts.
     """
     approach = (lane.chainage_m >= event_m - _APPROACH_M) & (lane.chainage_m <= event_m)
-    speed = float(lane.design_speed_mps[approach].max()) if approach.any() else float(lane.design_speed_mps[0])
+    speed = float(lane.design_speed_m_s[approach].max()) if approach.any() else float(lane.design_speed_m_s[0])
     if not isinstance(rule.before, str):
         return max(rule.before, rule.min_before_m)
     distance = speed * rule.reaction_s
     if rule.before == "stopping_distance":
         grade = float(lane.grade[approach].mean()) if approach.any() else 0.0
-        friction = max(rule.deceleration_mps2 / GRAVITY_MPS2 + grade, 0.05)
-        distance += speed**2 / (2 * GRAVITY_MPS2 * friction)
+        friction = max(rule.deceleration_m_s2 / GRAVITY_M_S2 + grade, 0.05)
+        distance += speed**2 / (2 * GRAVITY_M_S2 * friction)
     return max(distance, rule.min_before_m)
 
 

@@ -61,7 +61,7 @@ def _plates(plan: Plan) -> Iterator[PlanFinding]:
     if rules is None or not markers:
         return
     geometry = PlateGeometry(rules.n, rules.unit_mm, rules.gap_mm, rules.thickness_mm)
-    speeds = _by_lane(plan, markers, lambda lane, at: lane.value_at(lane.design_speed_mps, at))
+    speeds = _by_lane(plan, markers, lambda lane, at: lane.value_at(lane.design_speed_m_s, at))
     offsets = np.array([marker.offset_m for marker in markers])
     for camera in plan.rules.cameras:
         for condition in terms.conditions:

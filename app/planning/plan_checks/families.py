@@ -190,7 +190,7 @@ def _radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules, 
     spacing_m = min(max(2 * length_m / len(cerpms) / len(lanes), SPACINGS_M[0]), SPACINGS_M[1])
     made = RadioPlan(
         settings, rules.region or _DEFAULT_REGION, spacing_m=spacing_m,
-        design_speed_mps=max(float(lane.design_speed_mps.max()) for lane in plan.alignment.lanes),
+        design_speed_m_s=max(float(lane.design_speed_m_s.max()) for lane in plan.alignment.lanes),
         preview=PreviewRule(distance_m=rules.preview_m),
     )  # fmt: skip
     return replace(made, receiver=replace(made.receiver, channels=max(settings.channels, made.receiver.channels)))
@@ -410,13 +410,13 @@ def readable_zone_m(camera: Camera, geometry: PlateGeometry, left_m: float = 0.0
 
 
 def frames_per_pass(
-    camera: CameraRules, geometry: PlateGeometry, speed_mps: float, left_m: float = 0.0, grade_change: float = 0.0
+    camera: CameraRules, geometry: PlateGeometry, speed_m_s: float, left_m: float = 0.0, grade_change: float = 0.0
 ) -> float:
     """Mean number of frames of a pass in which a plate is readable; 0 where it is blurred too much."""
-    blur_units = speed_mps * camera.exposure_s / ((geometry.unit_mm + geometry.gap_mm) / 1000)
+    blur_units = speed_m_s * camera.exposure_s / ((geometry.unit_mm + geometry.gap_mm) / 1000)
     if blur_units > MAX_BLUR_UNITS:
         return 0.0
-    return readable_zone_m(camera_of(camera), geometry, left_m, grade_change) * camera.frames_per_s / speed_mps
+    return readable_zone_m(camera_of(camera), geometry, left_m, grade_change) * camera.frames_per_s / speed_m_s
 
 
 def check_plates(plan: Plan) -> Iterator[PlanFinding]:
@@ -439,11 +439,11 @@ def _frames(plan: Plan, plates: Sequence[PlannedMarker], camera: CameraRules, ru
     worst, frames, speed = plates[0], math.inf, 0.0
     for marker in plates:
         lane = plan.alignment.lane(marker.lane)
-        at_mps = float(lane.value_at(lane.design_speed_mps, marker.chainage_m))
-        blurred = at_mps * camera.exposure_s / unit_m > MAX_BLUR_UNITS
-        found = 0.0 if blurred else zones[marker.offset_m] * camera.frames_per_s / at_mps
+        at_m_s = float(lane.value_at(lane.design_speed_m_s, marker.chainage_m))
+        blurred = at_m_s * camera.exposure_s / unit_m > MAX_BLUR_UNITS
+        found = 0.0 if blurred else zones[marker.offset_m] * camera.frames_per_s / at_m_s
         if found < frames:
-            worst, frames, speed = marker, found, at_mps
+            worst, frames, speed = marker, found, at_m_s
     sentence = (
         f"mean readable frames per pass of {camera.name} at {speed * 3.6:.0f} km/h: {zones[worst.offset_m]:.1f} m "
         f"of road with {ROWS_PER_UNIT:g} rows per unit at {camera.frames_per_s:g} frames/s"
@@ -456,8 +456,8 @@ def _frames(plan: Plan, plates: Sequence[PlannedMarker], camera: CameraRules, ru
 
 def _rolling_shutter(plan: Plan, plates: Sequence[PlannedMarker], camera: CameraRules) -> PlanFinding:
     """Stretch of a plate by the rows that are read later, as a share of its length."""
-    worst = max(plates, key=lambda marker: _speed_mps(plan, marker))
-    speed = _speed_mps(plan, worst)
+    worst = max(plates, key=lambda marker: _speed_m_s(plan, marker))
+    speed = _speed_m_s(plan, worst)
     detail = worst.detail
     assert isinstance(detail, PlannedPlate)
     view = camera_of(camera)
@@ -485,6 +485,6 @@ def _room(plates: Sequence[PlannedMarker], rules: PlateRules) -> PlanFinding:
     return compare("plate-scheme", len(plates) - codes, "<=", 0, "plates", "PolyU section II.A", sentence)
 
 
-def _speed_mps(plan: Plan, marker: PlannedMarker) -> float:
+def _speed_m_s(plan: Plan, marker: PlannedMarker) -> float:
     lane = plan.alignment.lane(marker.lane)
-    return float(lane.value_at(lane.design_speed_mps, marker.chainage_m))
+    return float(lane.value_at(lane.design_speed_m_s, marker.chainage_m))

@@ -62,7 +62,7 @@ class DesignSpeed:
     """Pass for which a print must be readable."""
 
     camera: CameraRules
-    speed_mps: float
+    speed_m_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +109,11 @@ def predict_print(
     """
     found = read_passes(_face(reflectance, geometry), code, geometry, design, seed=seed)
     model = fitted_models().plate_model(DAY)
-    blur = design.speed_mps * design.camera.exposure_s / (geometry.pitch_mm / 1000)
+    blur = design.speed_m_s * design.camera.exposure_s / (geometry.pitch_mm / 1000)
     weight = _posterior(model, found.passes, blur)
-    rates = [read_rate_of_model(_shifted(model, shift), geometry, design.camera, design.speed_mps) for shift in _SHIFTS]
+    rates = [read_rate_of_model(_shifted(model, shift), geometry, design.camera, design.speed_m_s) for shift in _SHIFTS]
     return PrintPrediction(
-        readable_frames(geometry, design.camera, design.speed_mps),
+        readable_frames(geometry, design.camera, design.speed_m_s),
         len(found.passes),
         len(found.frames),
         sum(hit for _px, hit in found.frames),
@@ -236,7 +236,7 @@ def _scenes(
     face: Face, geometry: PlateGeometry, design: DesignSpeed, conditions: Conditions, rng: np.random.Generator
 ) -> Iterator[tuple[float, PlateScene]]:
     drive = Drive(
-        camera=camera_of(design.camera), face=face, speed_m_s=design.speed_mps, fps=design.camera.frames_per_s,
+        camera=camera_of(design.camera), face=face, speed_m_s=design.speed_m_s, fps=design.camera.frames_per_s,
         exposure_s=conditions.exposure_s, far_m=FAR_M, road_reflectance=conditions.road_reflectance,
         air=conditions.air, sensor=conditions.sensor,
     )  # fmt: skip
@@ -256,7 +256,7 @@ def render_view(
     geometry: PlateGeometry,
     rules: CameraRules,
     *,
-    speed_mps: float,
+    speed_m_s: float,
     ahead_m: float,
     left_m: float = 0.0,
     condition: Condition = Condition.DAY,
@@ -267,7 +267,7 @@ def render_view(
     ----------
     code : PlateCode
         Of the geometry's size.
-    speed_mps : float
+    speed_m_s : float
         [m/s]
     ahead_m, left_m : float
         The plate's centre from the camera, at mid-exposure. [m]
@@ -288,7 +288,7 @@ def render_view(
     camera = camera_of(rules)
     face = plate_face(code, geometry, drawn.look, drawn.wear, rng)
     scene = PlateScene(
-        camera=camera, faces=(PlacedFace(face, ahead_m, left_m),), speed_m_s=speed_mps, exposure_s=drawn.exposure_s,
+        camera=camera, faces=(PlacedFace(face, ahead_m, left_m),), speed_m_s=speed_m_s, exposure_s=drawn.exposure_s,
         road_reflectance=drawn.road_reflectance, night_light=drawn.night_light, shadow=drawn.shadow, air=drawn.air,
         sensor=sensor,
     )  # fmt: skip

@@ -31,7 +31,7 @@ DAY = "day"
 PLACING_SD_M = 0.01
 """[m] of placing a marker, each axis. Source: `PLACING_SD_M` of app/planning/proof/drives.py."""
 _NODES, _WEIGHTS = (np.asarray(part) for part in np.polynomial.hermite_e.hermegauss(15))
-_SPACING_UNIT_M, _SPEED_UNIT_MPS = 15.0, 15.0  # units of the powers; source: near the middle of the fitted drives
+_SPACING_UNIT_M, _SPEED_UNIT_M_S = 15.0, 15.0  # units of the powers; source: near the middle of the fitted drives
 
 
 def normal_quadrature() -> tuple[Floats, Floats]:
@@ -81,9 +81,9 @@ class MagnetModel:
     fix_share: float = 0.0
     fix_rms_m: float = 0.0
 
-    def read_rate(self, clearance_m: float, curvature_1pm: npt.ArrayLike) -> Floats:
+    def read_rate(self, clearance_m: float, curvature_per_m: npt.ArrayLike) -> Floats:
         """Of the shape of the curvatures."""
-        bend = np.abs(np.asarray(curvature_1pm, dtype=np.float64))
+        bend = np.abs(np.asarray(curvature_per_m, dtype=np.float64))
         return np.asarray(
             scipy.special.expit(self.at_16_cm + self.per_metre * (clearance_m - 0.16) + self.per_curvature * bend)
         )
@@ -104,14 +104,14 @@ class PathModel:
     worst_share: float  # mean greatest distance along 500 m, over the root mean square
 
     def rms_of(
-        self, survey_rmse_m: float, spacing_m: Floats, speed_mps: Floats, exact_rms_m: Floats, ends_per_m: Floats
+        self, survey_rmse_m: float, spacing_m: Floats, speed_m_s: Floats, exact_rms_m: Floats, ends_per_m: Floats
     ) -> Floats:
         """Of stretches, shape (K,); see `app.planning.predict.rates.Stretches`. [m]"""
         sigma = math.hypot(survey_rmse_m / math.sqrt(2), PLACING_SD_M)
         own = (
             math.hypot(self.exact_markers_m, self.marker_gain * sigma)
             * (spacing_m / _SPACING_UNIT_M) ** self.spacing_power
-            * (np.maximum(speed_mps, 1.0) / _SPEED_UNIT_MPS) ** self.speed_power
+            * (np.maximum(speed_m_s, 1.0) / _SPEED_UNIT_M_S) ** self.speed_power
         )
         return np.asarray(np.sqrt(own**2 * (1.0 + self.end_gain_m * ends_per_m) + self.exact_share * exact_rms_m**2))
 
@@ -176,20 +176,20 @@ STRETCH_M = 500.0
 """[m] of lane that path errors are predicted for. Source: `LANE_STRETCH_M` of app/planning/proof/prove.py."""
 _GRID_M = 0.02  # [m] between distances at which the view is computed
 _PHASES = 8  # of the first frame
-_SPEED_STEP_MPS = 0.5  # [m/s] speeds are rounded up to it; at most 4 % of 13 m/s
+_SPEED_STEP_M_S = 0.5  # [m/s] speeds are rounded up to it; at most 4 % of 13 m/s
 _OFFSET_STEP_M = 0.1  # [m] less than a vehicle's own 0.15 m
 
 
 def plate_rates(
     offsets_m: Floats,
-    speeds_mps: Floats,
+    speeds_m_s: Floats,
     geometry: PlateGeometry,
     camera: CameraRules,
     condition: str,
     rules: PredictionRules,
 ) -> Floats:
     """Probability that a pass reads each plate that is there, shape (K,), by its offset from the centre line [m]."""
-    speed = np.ceil(np.maximum(speeds_mps * rules.speed_share, 0.1) / _SPEED_STEP_MPS) * _SPEED_STEP_MPS
+    speed = np.ceil(np.maximum(speeds_m_s * rules.speed_share, 0.1) / _SPEED_STEP_M_S) * _SPEED_STEP_M_S
     offset = np.round(offsets_m / _OFFSET_STEP_M) * _OFFSET_STEP_M
     kinds, which = np.unique(np.column_stack([speed, offset]), axis=0, return_inverse=True)
     found = [plate_read_rate(geometry, camera, condition, v, left) for v, left in kinds.tolist()]
@@ -198,7 +198,7 @@ def plate_rates(
 
 @lru_cache(maxsize=4096)
 def plate_read_rate(
-    geometry: PlateGeometry, camera: CameraRules, condition: str, speed_mps: float, left_m: float
+    geometry: PlateGeometry, camera: CameraRules, condition: str, speed_m_s: float, left_m: float
 ) -> float:
     """Probability that a pass at a speed reads a plate beside the camera's path, on a flat and straight road.
 
@@ -207,39 +207,39 @@ def plate_read_rate(
     Frames follow each other at the speed's distance from a first one of any phase. Each is read with the log-odds of
     its unit's height; the pass's own circumstances shift all of them alike (`PlateModel`).
     """
-    return read_rate_of_model(fitted_models().plate_model(condition), geometry, camera, speed_mps, left_m)
+    return read_rate_of_model(fitted_models().plate_model(condition), geometry, camera, speed_m_s, left_m)
 
 
 def read_rate_of_model(
-    model: PlateModel, geometry: PlateGeometry, camera: CameraRules, speed_mps: float, left_m: float = 0.0
+    model: PlateModel, geometry: PlateGeometry, camera: CameraRules, speed_m_s: float, left_m: float = 0.0
 ) -> float:
     """As `plate_read_rate`, for another model than the fitted ones."""
     ahead = np.arange(_GRID_M, FAR_M, _GRID_M)
     height = unit_heights_px(camera_of(camera), geometry, ahead, left_m)
     exposures = [max(camera.exposure_s, least) for least in model.exposures_s] or [camera.exposure_s]
-    rates = [_rate(model, ahead, height, speed_mps, speed_mps * exposure, camera, geometry) for exposure in exposures]
+    rates = [_rate(model, ahead, height, speed_m_s, speed_m_s * exposure, camera, geometry) for exposure in exposures]
     return float(np.mean(rates))
 
 
-def readable_frames(geometry: PlateGeometry, camera: CameraRules, speed_mps: float) -> float:
+def readable_frames(geometry: PlateGeometry, camera: CameraRules, speed_m_s: float) -> float:
     """Mean number of frames of a pass in which a unit is `MIN_UNIT_PX` high or more, on a flat and straight road."""
     ahead = np.arange(_GRID_M, FAR_M, _GRID_M)
     in_reach = unit_heights_px(camera_of(camera), geometry, ahead) >= MIN_UNIT_PX
-    return float(in_reach.sum() * _GRID_M / (speed_mps / camera.frames_per_s))
+    return float(in_reach.sum() * _GRID_M / (speed_m_s / camera.frames_per_s))
 
 
 def _rate(
     model: PlateModel,
     ahead: Floats,
     height: Floats,
-    speed_mps: float,
+    speed_m_s: float,
     blur_m: float,
     camera: CameraRules,
     geometry: PlateGeometry,
 ) -> float:
     blur = blur_m / (geometry.pitch_mm / 1000)
     nodes, weights = normal_quadrature()
-    step = speed_mps / camera.frames_per_s
+    step = speed_m_s / camera.frames_per_s
     missed = 0.0
     for phase in (np.arange(_PHASES) + 0.5) / _PHASES:
         at = np.arange(phase * step, FAR_M, step)
@@ -280,7 +280,7 @@ class Stretches(NamedTuple):
     """Equal stretches of a lane with CERPMs, each of shape (S,)."""
 
     spacing_m: Floats  # [m] mean distance between pairs
-    speed_mps: Floats  # [m/s] mean design speed
+    speed_m_s: Floats  # [m/s] mean design speed
     # `exact_rms_m`, `exact_worst_m`: [m] distances of a cubic spline through the exact pairs of the lane from its
     # centre line
     exact_rms_m: Floats
@@ -303,7 +303,7 @@ def lane_stretches(lane: Lane, chainages_m: Floats) -> Stretches:
     ends[-1] += 1.0
     return Stretches(
         np.diff(borders) / np.maximum(pairs, 1),
-        np.bincount(stretch, lane.design_speed_mps, count) / samples,
+        np.bincount(stretch, lane.design_speed_m_s, count) / samples,
         np.sqrt(np.bincount(stretch, error**2, count) / samples),
         worst,
         ends / np.diff(borders),
@@ -314,7 +314,7 @@ def path_errors_m(lane: Lane, chainages_m: Floats, rules: PredictionRules) -> tu
     """Root mean square and greatest path error of each stretch of a lane with CERPMs at chainages, shape (S,). [m]"""
     found, model = lane_stretches(lane, chainages_m), fitted_models().path
     spacing = found.spacing_m / (1.0 - rules.lost_share)
-    speed = found.speed_mps * rules.speed_share
+    speed = found.speed_m_s * rules.speed_share
     rms = model.rms_of(rules.survey_rmse_m, spacing, speed, found.exact_rms_m, found.ends_per_m)
     return rms, np.maximum(rms * model.worst_share, np.sqrt(model.exact_share) * found.exact_worst_m)
 
@@ -405,12 +405,12 @@ class CameraPass:
     read_rates: dict[str, float]  # probability that a pass reads the plate, by condition
 
 
-def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_mps: float, left_m: float = 0.0) -> CameraPass:
+def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_m_s: float, left_m: float = 0.0) -> CameraPass:
     """Predict a pass.
 
     Parameters
     ----------
-    speed_mps : float
+    speed_m_s : float
         Above 0. [m/s]
     left_m : float
         Plate's centre left of the camera's path. [m]
@@ -425,14 +425,14 @@ def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_mps: float, l
     The rates are those of plans: `app.planning.predict.rates`. A single frame's probability is that of the same model
     without the spread between passes.
     """
-    if not speed_mps > 0:
-        raise InvalidParameter(f"the speed is {speed_mps:g} m/s", field="speed_kmh", limit="above 0")
+    if not speed_m_s > 0:
+        raise InvalidParameter(f"the speed is {speed_m_s:g} m/s", field="speed_kmh", limit="above 0")
     camera = camera_of(rules)
     grid = np.arange(_PASS_GRID_M, FAR_M, _PASS_GRID_M)
     unit_px = unit_heights_px(camera, geometry, grid, left_m)
     in_reach = grid[unit_px >= MIN_UNIT_PX]
-    step_m = speed_mps / rules.frames_per_s
-    blur_m = speed_mps * rules.exposure_s
+    step_m = speed_m_s / rules.frames_per_s
+    blur_m = speed_m_s * rules.exposure_s
     ahead = np.arange(step_m / 2, FAR_M, step_m)
     ahead = ahead[unit_heights_px(camera, geometry, ahead, left_m) >= MIN_UNIT_PX]
     every = max(-(-len(ahead) // MAX_FRAMES), 1)
@@ -441,7 +441,7 @@ def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_mps: float, l
         step_m=step_m,
         near_m=float(in_reach[0]) if len(in_reach) else None,
         far_m=float(in_reach[-1]) if len(in_reach) else None,
-        readable_frames=readable_frames(geometry, rules, speed_mps)
+        readable_frames=readable_frames(geometry, rules, speed_m_s)
         if not left_m
         else len(in_reach) * _PASS_GRID_M / step_m,
         best_unit_px=float(unit_px.max()),
@@ -449,7 +449,7 @@ def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_mps: float, l
         blur_units=blur_m / (geometry.pitch_mm / 1000),
         frames=_frames(camera, geometry, ahead[::every][::-1], left_m, blur_m),
         listed_every=every,
-        read_rates={name: plate_read_rate(geometry, rules, name, speed_mps, left_m) for name in models.plates},
+        read_rates={name: plate_read_rate(geometry, rules, name, speed_m_s, left_m) for name in models.plates},
     )
 
 

@@ -82,7 +82,7 @@ def drive_cerpms(one: LanePass) -> LanePath:
     merged = merge_markers(verified.packets, registered, simulated.track)
     at = dict(zip(installed.number.tolist(), installed.chainage_m.tolist(), strict=True))
     used = np.array([n in one.own and 0.0 <= at[n] <= high - low for n in merged.number.tolist()], bool)
-    columns = (merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_km_h)
+    columns = (merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh)
     path = fit_lane(LaneMarkers(*(column[used] for column in columns)), simulated.track)
     inside = np.isin(installed.number, list(one.own))
     inside &= (installed.chainage_m + low >= one.from_m) & (installed.chainage_m + low <= one.to_m)
@@ -206,7 +206,7 @@ REACH_M = 0.4
 _OTHER = -1  # tag number of magnets that are not driven for
 _TAG_REACH_M = 1.0  # [m] of a tag's reading from its first magnet; source: app/demo/magnets.py
 _WEAVE_M = 0.1  # [m] source: app/demo/magnets.py, between the 0.05 m of the benchmarks and its 0.12 m
-_CURVED_1PM = 1e-5  # [1/m] below it a road is straight; 100 km of radius
+_CURVED_PER_M = 1e-5  # [1/m] below it a road is straight; 100 km of radius
 _SLOWER = 0.5  # of the speed, to find out whether speed is the cause
 _HEADING_STD_DEG = 0.1  # [deg] of a tag's surveyed direction; source: TAG_BEARING_STD_DEG of the decoder
 
@@ -383,7 +383,7 @@ def _bends(lane: Lane, start_m: float, length_m: float) -> list[tuple[float, flo
     return [
         (float(a) - start_m, float(a) - start_m + step, 1 / float(k))
         for a, k in zip(at, curvature, strict=True)
-        if abs(k) > _CURVED_1PM
+        if abs(k) > _CURVED_PER_M
     ]
 
 

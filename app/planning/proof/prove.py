@@ -101,19 +101,19 @@ def markers_beside(frame: LaneFrame, markers: Sequence[PlannedMarker], reach_m: 
 # along the road is taken from a random start. Over several drives the sample moves, so that weak markers are found.
 
 
-_SPEED_STEP_MPS = 5.0  # [m/s] of the strata; 18 km/h
-_BEND_1PM = 1 / 400.0  # [1/m] source: the default of `road.curve_radius_m`
-_CREST_1PM = 1 / 1000.0  # [1/m] change of grade; sharper than any crest at 60 km/h
+_SPEED_STEP_M_S = 5.0  # [m/s] of the strata; 18 km/h
+_BEND_PER_M = 1 / 400.0  # [1/m] source: the default of `road.curve_radius_m`
+_CREST_PER_M = 1 / 1000.0  # [1/m] change of grade; sharper than any crest at 60 km/h
 
 
 def stratum_of(marker: PlannedMarker, lane: Lane) -> tuple[int, bool, bool, str]:
     """What makes markers alike: speed, bend, crest or sag, purpose."""
     at = marker.chainage_m
-    speed = float(lane.value_at(lane.design_speed_mps, at))
-    bend = abs(float(lane.value_at(lane.curvature_per_m, at))) > _BEND_1PM
+    speed = float(lane.value_at(lane.design_speed_m_s, at))
+    bend = abs(float(lane.value_at(lane.curvature_per_m, at))) > _BEND_PER_M
     before = max(at - 10.0, 0.0)
     change = float(lane.value_at(lane.grade, at) - lane.value_at(lane.grade, before)) / 10.0
-    return int(speed / _SPEED_STEP_MPS), bend, abs(change) > _CREST_1PM, str(marker.purpose)
+    return int(speed / _SPEED_STEP_M_S), bend, abs(change) > _CREST_PER_M, str(marker.purpose)
 
 
 def sample_markers(
@@ -374,7 +374,7 @@ class Prover:
 
     def _speed_m_s(self, lane: str, at_m: float) -> float:
         one = self.lanes[lane]
-        return self.terms.speed_share * float(one.value_at(one.design_speed_mps, at_m))
+        return self.terms.speed_share * float(one.value_at(one.design_speed_m_s, at_m))
 
     # --- plates -----------------------------------------------------------------------------------------------------
 

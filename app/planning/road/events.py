@@ -54,7 +54,7 @@ def find_events(
     for lane in lanes:
         if lane.name not in curved:
             events += find_curves(lane, rules.curve_radius_m, rules.curve_turn_deg)
-        if lane.name not in limited and by_name[lane.name].speed_limit_mps is not None and not rules.override_speed:
+        if lane.name not in limited and by_name[lane.name].speed_limit_m_s is not None and not rules.override_speed:
             events += _speed_changes(lane)
     order = {lane.name: k for k, lane in enumerate(lanes)}
     return sorted(events, key=lambda event: (order[event.lane], event.chainage_m))
@@ -94,10 +94,10 @@ def find_curves(lane: Lane, radius_m: float, turn_deg: float) -> list[RoadEvent]
 
 
 def _speed_changes(lane: Lane) -> list[RoadEvent]:
-    changes = np.flatnonzero(np.abs(np.diff(lane.design_speed_mps)) > 0.01) + 1  # never where a speed is unknown
+    changes = np.flatnonzero(np.abs(np.diff(lane.design_speed_m_s)) > 0.01) + 1  # never where a speed is unknown
     return [
         RoadEvent(
-            EventKind.SPEED_LIMIT, lane.name, float(lane.chainage_m[k]), round(float(lane.design_speed_mps[k]) * 3.6, 3)
+            EventKind.SPEED_LIMIT, lane.name, float(lane.chainage_m[k]), round(float(lane.design_speed_m_s[k]) * 3.6, 3)
         )
         for k in changes.tolist()
     ]

@@ -166,7 +166,7 @@ def steps_m(lon_deg: Floats, lat_deg: Floats) -> tuple[Floats, Floats]:
 
 _REACH_M = 7.0  # [m] over which a vertex between long pieces turns, to each side; source: half of 14 m, the longest
 # spacing of the Karlsruhe map's bends (issue 13)
-_NOISE_1PM = 4e-4  # [1/m] standard deviation of curvature that noise may cause; source: radii above 500 m at 5 sigma
+_NOISE_PER_M = 4e-4  # [1/m] standard deviation of curvature that noise may cause; source: radii above 500 m at 5 sigma
 _SMOOTHING_M = (2.0, 8.0)  # [m] least and most standard deviation of the Gaussian; a bend with
 # a radius of 6 m keeps 97 % of its curvature at the least, one of 60 m turning 30 degrees 95 % at the most
 _END_FIT = 6.0  # widths of the Gaussian over which the ends are fitted; noise as between the ends
@@ -236,7 +236,7 @@ def smoothing_m(noise_m: float, spacing_m: float) -> float:
 
     Of white noise s at spacing d, a Gaussian of width w leaves a curvature with variance s^2 d 3 / (8 sqrt(pi) w^5).
     """
-    width = (noise_m**2 * spacing_m * _BEND_NORM / _NOISE_1PM**2) ** 0.2
+    width = (noise_m**2 * spacing_m * _BEND_NORM / _NOISE_PER_M**2) ** 0.2
     return float(np.clip(width, *_SMOOTHING_M))
 
 

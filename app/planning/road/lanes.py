@@ -137,7 +137,7 @@ def clear_width(lane: Lane, warnings: list[str]) -> Lane:
     kept = slice(first, last + 1)
     arrays = (
         "lon_deg", "lat_deg", "height_m", "heading_deg", "curvature_per_m", "grade", "superelevation_rad", "width_m",
-        "design_speed_mps", "station_m",
+        "design_speed_m_s", "station_m",
     )  # fmt: skip
     cut = {name: getattr(lane, name)[kept] for name in arrays}
     return replace(lane, chainage_m=lane.chainage_m[kept] - lane.chainage_m[first], **cut)
@@ -151,7 +151,7 @@ def check_speed(lane: Lane) -> None:
     InvalidParameter
         Neither the file nor the rules state one.
     """
-    missing = np.flatnonzero(~np.isfinite(lane.design_speed_mps))
+    missing = np.flatnonzero(~np.isfinite(lane.design_speed_m_s))
     if len(missing):
         raise InvalidParameter(
             f"{_at(lane, int(missing[0]))}: neither the file nor the rules state a speed",
@@ -229,7 +229,7 @@ def check_radii(lanes: Sequence[Lane]) -> list[str]:
     warnings = []
     speeds, radii = np.array(_RADII).T
     for lane in lanes:
-        speed_kmh = lane.design_speed_mps * 3.6
+        speed_kmh = lane.design_speed_m_s * 3.6
         least = np.interp(speed_kmh, speeds, radii) * np.minimum(speed_kmh / speeds[0], 1.0) ** 2
         excess = np.nan_to_num(np.abs(lane.curvature_per_m) * least)
         k = int(np.argmax(excess))
@@ -309,7 +309,7 @@ def make_lane(geometry: LaneGeometry, lines: tuple[GroundLine, ...], rules: Road
         grade_of(centre.height_m, step),
         np.nan_to_num(_values(geometry.superelevation_rad, centre.index), nan=0.0),
         width,
-        _speeds(geometry.speed_limit_mps, centre.index, rules),
+        _speeds(geometry.speed_limit_m_s, centre.index, rules),
         centre.chainage_m if geometry.station_m is None else _values(geometry.station_m, centre.index),
         geometry.left_style,
         geometry.right_style,

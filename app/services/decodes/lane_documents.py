@@ -19,9 +19,9 @@ if TYPE_CHECKING:  # it loads numba
 
 Floats = npt.NDArray[np.float64]
 LonLat = list[list[float]]
-_STRAIGHT_1PM = 1e-4
+_STRAIGHT_PER_M = 1e-4
 GeometryType = Literal["LineString", "MultiLineString", "Point"]
-_OF_PATH = ("method", "localization_grade", "length_m", "sigma_median_m", "refusal", "speed_limits_km_h")
+_OF_PATH = ("method", "localization_grade", "length_m", "sigma_median_m", "refusal", "speed_limits_kmh")
 _OF_MARKER = ("number", "side", "left_out", "packets")
 _IN_GEOMETRY = ("lon_deg", "lat_deg")
 
@@ -43,9 +43,9 @@ class LaneStations(TypedDict):
     east_m: list[float | None]
     down_m: list[float | None]
     heading_deg: list[float | None]
-    curvature_1pm: list[float | None]
+    curvature_per_m: list[float | None]
     width_m: list[float | None]
-    speed_limit_km_h: list[float | None]
+    speed_limit_kmh: list[float | None]
     preview_m: list[float | None]
     sigma_m: list[float | None]
     confidence: list[float | None]
@@ -76,7 +76,7 @@ class DecodedLaneDocument(TypedDict):
     sigma_median_m: float | None
     sigma_max_m: float | None
     min_radius_m: float | None
-    speed_limits_km_h: list[float]
+    speed_limits_kmh: list[float]
     track_agreement: TrackAgreementDocument | None
     origin: Origin
     stations: LaneStations
@@ -141,7 +141,7 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
     """
     origin = (lane.origin_lon_deg, lane.origin_lat_deg)
     known = len(lane.station_m) > 0
-    sharpest = float(np.abs(lane.curvature_1pm).max()) if known else 0.0
+    sharpest = float(np.abs(lane.curvature_per_m).max()) if known else 0.0
     has_sigma = known and bool(np.isfinite(lane.sigma_m).all())
     return {
         "method": lane.method,
@@ -151,8 +151,8 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
         "length_m": round(float(lane.station_m[-1]), 3) if known else 0.0,
         "sigma_median_m": round(float(np.median(lane.sigma_m)), 4) if has_sigma else None,
         "sigma_max_m": round(float(lane.sigma_m.max()), 4) if has_sigma else None,
-        "min_radius_m": round(1 / sharpest, 1) if sharpest > _STRAIGHT_1PM else None,
-        "speed_limits_km_h": _distinct(lane.speed_limit_km_h),
+        "min_radius_m": round(1 / sharpest, 1) if sharpest > _STRAIGHT_PER_M else None,
+        "speed_limits_kmh": _distinct(lane.speed_limit_kmh),
         "track_agreement": _track_agreement(lane.track_agreement),
         "origin": {"lon_deg": origin[0], "lat_deg": origin[1]},
         "stations": {
@@ -163,9 +163,9 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
             "east_m": _column(lane.east_m, 4),
             "down_m": _column(lane.down_m, 4),
             "heading_deg": _column(lane.heading_deg, 4),
-            "curvature_1pm": _column(lane.curvature_1pm, 6),
+            "curvature_per_m": _column(lane.curvature_per_m, 6),
             "width_m": _column(lane.width_m, 3),
-            "speed_limit_km_h": _column(lane.speed_limit_km_h, 3),
+            "speed_limit_kmh": _column(lane.speed_limit_kmh, 3),
             "preview_m": _column(lane.station_m[-1] - lane.station_m if known else lane.station_m, 3),
             "sigma_m": _column(lane.sigma_m, 4),
             "confidence": _column(lane.confidence, 5),

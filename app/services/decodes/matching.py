@@ -386,7 +386,7 @@ def read_packets_of(
 def lane_markers(merged: MergedMarkers) -> LaneMarkers:
     """Merged markers as the lane's fit takes them."""
     return LaneMarkers(
-        merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_km_h
+        merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh
     )
 
 

@@ -162,7 +162,7 @@ def _check_steering(lane: Lane, controller: Controller | None) -> SteeringCheck 
         return None
     from app.simulation.steering import check_steering
 
-    limit = lane.speed_limit_km_h
+    limit = lane.speed_limit_kmh
     speed = np.where(np.isfinite(limit), limit, np.nanmin(limit) if np.isfinite(limit).any() else _DEFAULT_SPEED_KM_H)
     try:
         return check_steering(lane.position_enu_m, speed, controller=controller)

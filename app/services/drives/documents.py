@@ -67,7 +67,7 @@ class DriveReceiver(TypedDict):
     used: int
     left_out: Annotated[int, Field(description="Too far from the track by all others.")]
     stated_m: Annotated[float, Field(description="Median of the standard deviations that the receiver states.")]
-    believed_m: Annotated[float, Field(description="The same, enlarged to what the markers show of it.")]
+    assumed_m: Annotated[float, Field(description="The same, enlarged to what the markers show of it.")]
 
 
 class DriveGap(TypedDict):
@@ -218,7 +218,7 @@ def track_report(
         "receivers": [
             {
                 "decode_id": entry.source, "clock": entry.clock, "used": entry.used, "left_out": entry.left_out,
-                "stated_m": round(entry.stated_m, 3), "believed_m": round(entry.believed_m, 3),
+                "stated_m": round(entry.stated_m, 3), "assumed_m": round(entry.assumed_m, 3),
             }
             for entry in track.receivers
         ],
@@ -247,9 +247,9 @@ def _clock_warnings(track: Track) -> list[str]:
 def _receiver_warnings(track: Track) -> list[str]:
     return [
         f"the positions of the receiver of decode {entry.source} are further from the markers than their standard "
-        f"deviation of {entry.stated_m:.2g} m allows: {entry.believed_m:.2g} m were assumed"
+        f"deviation of {entry.stated_m:.2g} m allows: {entry.assumed_m:.2g} m were assumed"
         for entry in track.receivers
-        if entry.believed_m > _DOUBTED * entry.stated_m
+        if entry.assumed_m > _DOUBTED * entry.stated_m
     ]
 
 

@@ -36,7 +36,7 @@ class DesignDocument(TypedDict):
 class OdometerDocument(TypedDict):
     """Errors of the vehicle's speed."""
 
-    quantum_mps: float
+    quantum_m_s: float
     rate_hz: float
     drift: float
 
@@ -44,7 +44,7 @@ class OdometerDocument(TypedDict):
 class RulesDocument(TypedDict):
     """Rules of a codebook."""
 
-    speed_mps: float
+    speed_m_s: float
     clearance_m: float
     odometer: OdometerDocument
     confusion: float
@@ -139,7 +139,7 @@ _ACCURACY = 0.99
 def rules_of(row: CodebookRow) -> CodebookRules:
     """Rules of a book's row."""
     rules = dict(row.rules)
-    speed, clearance, odometer = (rules.pop(name) for name in ("speed_mps", "clearance_m", "odometer"))
+    speed, clearance, odometer = (rules.pop(name) for name in ("speed_m_s", "clearance_m", "odometer"))
     return CodebookRules(ReadingConditions(speed, clearance, OdometerError(**odometer)), **rules)
 
 
@@ -153,7 +153,7 @@ def rules_columns(rules: CodebookRules) -> RulesDocument:
     """Rules as plain values; the decoder's errors are those of its version, not the book's."""
     at = rules.conditions
     return {
-        "speed_mps": at.speed_mps,
+        "speed_m_s": at.speed_m_s,
         "clearance_m": at.clearance_m,
         "odometer": document_of(OdometerDocument, at.odometer),
         "confusion": rules.confusion,

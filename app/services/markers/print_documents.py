@@ -214,7 +214,7 @@ def _prediction(found: PrintPrediction, design: DesignSpeed) -> PrintPredictionD
     return document_of(
         PrintPredictionDocument,
         found,
-        speed_kmh=round(design.speed_mps * 3.6, 3),
+        speed_kmh=round(design.speed_m_s * 3.6, 3),
         camera=design.camera.name,
         condition="day",
         readable_frames_per_pass=round(found.readable_frames, 1),

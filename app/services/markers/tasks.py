@@ -89,7 +89,7 @@ def render_camera_view(
     code: PlateCode,
     geometry: PlateGeometry,
     camera: CameraRules,
-    speed_mps: float,
+    speed_m_s: float,
     ahead_m: float,
     left_m: float,
     condition: Condition,
@@ -97,4 +97,4 @@ def render_camera_view(
     """Render a plate as a camera sees it, whose centre is so far ahead and to the left, and decode it."""
     from app.planning.predict.printed_plate import render_view
 
-    return render_view(code, geometry, camera, speed_mps=speed_mps, ahead_m=ahead_m, left_m=left_m, condition=condition)
+    return render_view(code, geometry, camera, speed_m_s=speed_m_s, ahead_m=ahead_m, left_m=left_m, condition=condition)

@@ -137,7 +137,7 @@ def extent_deg(road: Alignment) -> list[float]:
 
 def _lane_summary(lane: Lane) -> LaneSummary:
     sharpest = float(np.abs(lane.curvature_per_m).max())
-    speed = lane.design_speed_mps * 3.6
+    speed = lane.design_speed_m_s * 3.6
     return {
         "name": lane.name,
         "road": lane.road,
@@ -172,7 +172,7 @@ def alignment_profile(road: Alignment, samples: int) -> AlignmentProfile:
 
 def _lane_profile(road: Alignment, lane: Lane, samples: int) -> LaneProfile:
     at = np.unique(np.linspace(0, len(lane.chainage_m) - 1, min(samples, len(lane.chainage_m))).round().astype(int))
-    speed = lane.design_speed_mps[at] * 3.6
+    speed = lane.design_speed_m_s[at] * 3.6
     return {
         "name": lane.name,
         "road": lane.road,

@@ -150,7 +150,7 @@ def drive_lane(lane: TrueLane, driver: Driver, rng: np.random.Generator, *, star
     bend = np.interp(
         inside,
         lane.chainage_m,
-        scipy.ndimage.gaussian_filter1d(lane.curvature_1pm, _CURVATURE_SD_M / lane.chainage_m[1]),
+        scipy.ndimage.gaussian_filter1d(lane.curvature_per_m, _CURVATURE_SD_M / lane.chainage_m[1]),
     )
     left = matern_noise(len(time), _TICK_S, driver.wander_time_s, rng) * driver.wander_sd_m
     left = left + float(rng.normal(0, driver.habit_sd_m)) + float(rng.normal(1, 1)) * driver.cut_m2 * bend
@@ -243,7 +243,7 @@ def _recursed(values: Floats, keep: float) -> Floats:
 def _advance(lane: TrueLane, driver: Driver, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
     """Times, chainages and speeds of the drive: slower in bends, and uneven."""
     step = float(lane.chainage_m[1])
-    cap = np.sqrt(_LATERAL_M_S2 / np.maximum(np.abs(lane.curvature_1pm), 1e-6))
+    cap = np.sqrt(_LATERAL_M_S2 / np.maximum(np.abs(lane.curvature_per_m), 1e-6))
     cap = scipy.ndimage.minimum_filter1d(np.minimum(cap, driver.speed_m_s), int(_SLOW_BEFORE_M / step), mode="nearest")
     cap = scipy.ndimage.gaussian_filter1d(cap, _CURVATURE_SD_M / step, mode="nearest")
     pad = int(driver.lead_m / step) + 1

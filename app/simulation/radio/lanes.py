@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 Origin = tuple[float, float, float]
 
 STEP_M = 0.25  # [m] between stations; an eighth of the smoothing of 2.2 m
-_MAX_CURVATURE_1PM = 0.04  # [1/m] a radius of 25 m
+_MAX_CURVATURE_PER_M = 0.04  # [1/m] a radius of 25 m
 _CAR_SMOOTHING_M = 3.0  # [m] about a wheelbase
 _MAX_TURN_RAD = 2.2  # [rad] of the direction against the first one, so that lanes do not cross themselves
 
@@ -35,10 +35,10 @@ class TrueLane:
     centre_m: Floats
     left_m: Floats
     right_m: Floats
-    # `yaw_rad`, `curvature_1pm`: shape (N,): anticlockwise from east, unwrapped; positive to the left. On lanes from
+    # `yaw_rad`, `curvature_per_m`: shape (N,): anticlockwise from east, unwrapped; positive to the left. On lanes from
     # polylines, over a Gaussian of 2.2 m.
     yaw_rad: Floats
-    curvature_1pm: Floats
+    curvature_per_m: Floats
 
     @property
     def length_m(self) -> float:
@@ -101,7 +101,7 @@ def lane_between(left_m: npt.ArrayLike, right_m: npt.ArrayLike, origin: Origin) 
         They are not the boundaries of a lane: see `cut_lane`.
     """
     cut = cut_lane(left_m, right_m, step_m=STEP_M)
-    return TrueLane(origin, cut.chainage_m, cut.centre_m, cut.left_m, cut.right_m, cut.yaw_rad, cut.curvature_1pm)
+    return TrueLane(origin, cut.chainage_m, cut.centre_m, cut.left_m, cut.right_m, cut.yaw_rad, cut.curvature_per_m)
 
 
 def lane_from_wgs84(left_deg: npt.ArrayLike, right_deg: npt.ArrayLike, *, height_m: float = 0.0) -> TrueLane:
@@ -130,7 +130,7 @@ def make_lane(
     rng: np.random.Generator,
     *,
     length_m: float = 500.0,
-    max_curvature_1pm: float = _MAX_CURVATURE_1PM,
+    max_curvature_per_m: float = _MAX_CURVATURE_PER_M,
     width_m: tuple[float, float] = (2.7, 3.6),
     origin: Origin = (-83.7, 42.3, 250.0),
 ) -> TrueLane:
@@ -142,7 +142,7 @@ def make_lane(
         Draws bends, width and direction.
     length_m : float
         Of the centre line, 50 m to 2,000 km. [m]
-    max_curvature_1pm : float
+    max_curvature_per_m : float
         Sharpest bend; half of the bends are below a third of it. [1/m]
     width_m : tuple of float
         Minimum and maximum width. [m]
@@ -153,12 +153,12 @@ def make_lane(
         A value is out of its range.
     """
     low, high = width_m
-    if not (50 <= length_m <= 2e6 and 0 <= max_curvature_1pm <= 0.1 and 1.5 <= low <= high <= 12):
+    if not (50 <= length_m <= 2e6 and 0 <= max_curvature_per_m <= 0.1 and 1.5 <= low <= high <= 12):
         raise InvalidParameter(
-            f"a lane of {length_m:g} m, {max_curvature_1pm:g} 1/m, {low:g} to {high:g} m wide",
+            f"a lane of {length_m:g} m, {max_curvature_per_m:g} 1/m, {low:g} to {high:g} m wide",
             limit="50 m to 2,000 km long, at most 0.1 1/m, 1.5 to 12 m wide",
         )
-    knots = _bends(rng, length_m, max_curvature_1pm)
+    knots = _bends(rng, length_m, max_curvature_per_m)
     count = round(length_m / STEP_M) + 1
     at = np.asarray(np.arange(count) * STEP_M, np.float64)
     curvature = np.interp(at, knots[:, 0], knots[:, 1])
@@ -172,13 +172,13 @@ def make_lane(
     return TrueLane(origin, at, centre, centre + aside, centre - aside, yaw, curvature)
 
 
-def _bends(rng: np.random.Generator, length_m: float, sharpest_1pm: float) -> Floats:
+def _bends(rng: np.random.Generator, length_m: float, sharpest_per_m: float) -> Floats:
     """Chainage and curvature where clothoids begin and end, shape (K, 2); curvature is linear between. [m, 1/m]"""
     knots = [(0.0, 0.0)]
     heading = 0.0
     while knots[-1][0] < length_m:
         start = knots[-1][0] + float(rng.uniform(5, 60))
-        size = sharpest_1pm * (float(rng.uniform(0.33, 1)) if rng.random() < 0.5 else float(rng.uniform(0.02, 0.33)))
+        size = sharpest_per_m * (float(rng.uniform(0.33, 1)) if rng.random() < 0.5 else float(rng.uniform(0.02, 0.33)))
         clothoid = max(float(rng.uniform(10, 40)), 600 * size)
         arc = min(float(rng.uniform(10, 120)), max(1.8 / max(size, 1e-9) - clothoid, 5.0))
         sign = 1.0 if rng.random() < 0.5 else -1.0

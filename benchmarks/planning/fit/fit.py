@@ -82,7 +82,7 @@ def _rounded_plates(model: PlateModel, fix_rms_m: float, exposures_s: tuple[floa
 
 def fit_tags(seen: Sequence[TagPassSeen]) -> MagnetModel:
     """Logistic regression on clearance and curvature."""
-    clearance, bend = np.array([one.clearance_m for one in seen]), np.array([one.curvature_1pm for one in seen])
+    clearance, bend = np.array([one.clearance_m for one in seen]), np.array([one.curvature_per_m for one in seen])
     read = np.array([float(one.read) for one in seen])
     values = _logistic(clearance, bend, read, np.ones(len(seen)))
     fixes = [one.fix_m for one in seen if one.fix_m is not None]
@@ -95,7 +95,7 @@ def fit_lines(seen: Sequence[LineSeen]) -> MagnetModel:
     passed = np.array([float(one.magnets) for one in seen])
     return MagnetModel(
         *_logistic(
-            np.array([one.clearance_m for one in seen]), np.array([one.curvature_1pm for one in seen]),
+            np.array([one.clearance_m for one in seen]), np.array([one.curvature_per_m for one in seen]),
             np.array([float(one.read) for one in seen]), passed,
         )
     )  # fmt: skip
@@ -122,7 +122,7 @@ def fit_path(seen: Sequence[PathSeen]) -> PathModel:
     """
     survey, spacing, speed, exact, ends, rms = (
         np.array([getattr(one, name) for one in seen])
-        for name in ("survey_m", "spacing_m", "speed_mps", "exact_rms_m", "ends_per_m", "rms_m")
+        for name in ("survey_m", "spacing_m", "speed_m_s", "exact_rms_m", "ends_per_m", "rms_m")
     )
 
     def model(t: Floats) -> PathModel:

@@ -44,10 +44,10 @@ class TagPassSeen(NamedTuple):
     """A pass over a tag."""
 
     clearance_m: float
-    speed_mps: float
+    speed_m_s: float
     segment_m: float
     magnets: int
-    curvature_1pm: float
+    curvature_per_m: float
     read: bool
     fix_m: float | None
 
@@ -56,8 +56,8 @@ class LineSeen(NamedTuple):
     """A drive along a line: magnets under the bar, and those that were read."""
 
     clearance_m: float
-    speed_mps: float
-    curvature_1pm: float
+    speed_m_s: float
+    curvature_per_m: float
     magnets: int
     read: int
 
@@ -67,7 +67,7 @@ class PathSeen(NamedTuple):
 
     spacing_m: float
     survey_m: float
-    speed_mps: float
+    speed_m_s: float
     exact_rms_m: float
     ends_per_m: float
     rms_m: float
@@ -87,11 +87,11 @@ def plate_passes(condition: str, count: int, seed: int) -> Iterator[PlatePassSee
             horizontal_fov_deg=float(rng.uniform(50, 100)), height_m=float(rng.uniform(1.2, 2.6)),
             depression_deg=float(rng.uniform(12, 35)), exposure_s=_log_uniform(rng, *_EXPOSURES_S),
         )  # fmt: skip
-        speed_mps = float(rng.uniform(*_SPEEDS_KMH)) / 3.6
+        speed_m_s = float(rng.uniform(*_SPEEDS_KMH)) / 3.6
         one = prover.plate_pass(marker, DriveTerms(k, condition, camera))
-        one = replace(one, speed_m_s=speed_mps, fps=speed_mps / _FRAME_STEP_M)
+        one = replace(one, speed_m_s=speed_m_s, fps=speed_m_s / _FRAME_STEP_M)
         seen = read_frames(one)
-        blur = speed_mps * one.conditions.exposure_s / (marker.detail.geometry.pitch_mm / 1000)
+        blur = speed_m_s * one.conditions.exposure_s / (marker.detail.geometry.pitch_mm / 1000)
         fix = None if seen.fix_m is None else math.hypot(*seen.fix_m)
         yield PlatePassSeen(blur, seen.frames, fix)
 
@@ -171,7 +171,7 @@ def path_seen(prover: Prover, unit: ProofUnit, survey_m: float) -> PathSeen:
     stretches = lane_stretches(lane, np.array(own))
     k = round(unit.from_m / (unit.to_m - unit.from_m))
     return PathSeen(
-        float(stretches.spacing_m[k]), survey_m, float(stretches.speed_mps[k]), float(stretches.exact_rms_m[k]),
+        float(stretches.spacing_m[k]), survey_m, float(stretches.speed_m_s[k]), float(stretches.exact_rms_m[k]),
         float(stretches.ends_per_m[k]),
         math.sqrt(found["square_sum_m2"] / max(found["covered"], 1)), found["worst_m"],
     )  # fmt: skip

@@ -3454,7 +3454,7 @@ export interface components {
             right: number[][][];
             sigma_max_m: number | null;
             sigma_median_m: number | null;
-            speed_limits_km_h: number[];
+            speed_limits_kmh: number[];
             stations: components["schemas"]["LaneStations"];
             track_agreement: components["schemas"]["TrackAgreementDocument"] | null;
         };
@@ -3708,7 +3708,7 @@ export interface components {
             items: components["schemas"]["DriveHead"][];
         };
         DriveReceiver: {
-            believed_m: number;
+            assumed_m: number;
             clock: string;
             decode_id: string;
             left_out: number;
@@ -4435,7 +4435,7 @@ export interface components {
         };
         LaneStations: {
             confidence: (number | null)[];
-            curvature_1pm: (number | null)[];
+            curvature_per_m: (number | null)[];
             down_m: (number | null)[];
             east_m: (number | null)[];
             heading_deg: (number | null)[];
@@ -4444,7 +4444,7 @@ export interface components {
             north_m: (number | null)[];
             preview_m: (number | null)[];
             sigma_m: (number | null)[];
-            speed_limit_km_h: (number | null)[];
+            speed_limit_kmh: (number | null)[];
             station_m: (number | null)[];
             width_m: (number | null)[];
         };
@@ -4858,14 +4858,14 @@ export interface components {
         };
         OdometerDocument: {
             drift: number;
-            quantum_mps: number;
+            quantum_m_s: number;
             rate_hz: number;
         };
         OdometerIn: {
             /** @default 0.001 */
             drift?: number;
             /** @default 0.01 */
-            quantum_mps?: number;
+            quantum_m_s?: number;
             /** @default 10 */
             rate_hz?: number;
         };
@@ -5444,7 +5444,7 @@ export interface components {
         };
         PreviewIn: {
             /** @default 3.4 */
-            deceleration_mps2?: number;
+            deceleration_m_s2?: number;
             distance_m?: number | null;
             /** @default 2.5 */
             reaction_s?: number;
@@ -5686,7 +5686,7 @@ export interface components {
         RadioCheckIn: {
             battery?: components["schemas"]["BatteryIn"];
             /** @default 13.4 */
-            design_speed_mps?: number;
+            design_speed_m_s?: number;
             markers?: components["schemas"]["PlacedMarkersIn"] | null;
             /** @default 365 */
             min_battery_days?: number;
@@ -6132,7 +6132,7 @@ export interface components {
             clearance_m: number;
             confusion: number;
             odometer: components["schemas"]["OdometerDocument"];
-            speed_mps: number;
+            speed_m_s: number;
             survive_missing: boolean;
             wrong_way_safe: boolean;
         };
@@ -6143,7 +6143,7 @@ export interface components {
             confusion?: number;
             odometer?: components["schemas"]["OdometerIn"];
             /** @default 13.4 */
-            speed_mps?: number;
+            speed_m_s?: number;
             /** @default false */
             survive_missing?: boolean;
             /** @default false */
@@ -6251,8 +6251,8 @@ export interface components {
             token_url: string;
         };
         SiteDocument: {
-            deceleration_mps2: number;
-            design_speed_mps: number | null;
+            deceleration_m_s2: number;
+            design_speed_m_s: number | null;
             reaction_s: number;
             readable_clearance_m: number;
             stop_line_chainage_m: number | null;
@@ -6260,8 +6260,8 @@ export interface components {
         };
         SiteIn: {
             /** @default 3.4 */
-            deceleration_mps2?: number;
-            design_speed_mps?: number | null;
+            deceleration_m_s2?: number;
+            design_speed_m_s?: number | null;
             /** @default 2.5 */
             reaction_s?: number;
             /** @default 0.3 */

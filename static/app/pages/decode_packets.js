@@ -48,7 +48,7 @@ export function Lane({ decode }) {
     <${Facts} of=${[
       [t("decode.length"), number(lane.length_m, 1, "m")],
       [t("decode.accuracy"), t("decode.accuracy_text", { median: number(100 * lane.sigma_median_m, 1), max: number(100 * lane.sigma_max_m, 1) })],
-      [t("marker.speed_limit"), lane.speed_limits_km_h.length ? `${lane.speed_limits_km_h.map((/** @type {number} */ limit) => number(limit)).join(", ")} km/h` : null],
+      [t("marker.speed_limit"), lane.speed_limits_kmh.length ? `${lane.speed_limits_kmh.map((/** @type {number} */ limit) => number(limit)).join(", ")} km/h` : null],
       [t("decode.sharpest"), lane.min_radius_m === null ? null : number(lane.min_radius_m, 0, "m")],
       [t("field.grade"), textOr(`grade.${lane.localization_grade}`, lane.localization_grade)],
     ]} />

@@ -66,7 +66,7 @@ function One({ id, onChanged }) {
         <${Used} book=${book} />
         <${Facts} of=${[
           [t("codebooks.design"), designText(book.design)],
-          [t("codebooks.read_at"), t("codebooks.read_at_text", { speed: number(book.rules.speed_mps * 3.6), clearance: number(book.rules.clearance_m, 2) })],
+          [t("codebooks.read_at"), t("codebooks.read_at_text", { speed: number(book.rules.speed_m_s * 3.6), clearance: number(book.rules.clearance_m, 2) })],
           [t("codebooks.wrong_way"), book.rules.wrong_way_safe && t("changes.yes")],
           [t("codebooks.missing"), book.rules.survive_missing && t("changes.yes")],
           [t("codebooks.confusion"), t("codebooks.confusion_text", { one: number(1 / book.rules.confusion) })],
@@ -180,7 +180,7 @@ function MakeDialog({ onClose, onMade }) {
           <${FormFrame} form=${form} onSubmit=${submit} button=${t("codebooks.make")}>
             <${TextField} form=${form} path="name" label=${t("field.name")} required />
             <${Group} title=${t("codebooks.design")}>${["magnets", "length_m", "segment_m", "min_gap_m"].map((name) => field(`design.${name}`, textOr(`codebooks.${name}`, name)))}</${Group}>
-            <${Group} title=${t("codebooks.rules")}>${["speed_mps", "clearance_m", "confusion", "wrong_way_safe", "survive_missing"].map((name) => field(`rules.${name}`, textOr(`codebooks.${name}`, name)))}</${Group}>
+            <${Group} title=${t("codebooks.rules")}>${["speed_m_s", "clearance_m", "confusion", "wrong_way_safe", "survive_missing"].map((name) => field(`rules.${name}`, textOr(`codebooks.${name}`, name)))}</${Group}>
             <${MeaningsField} form=${form} />
           </${FormFrame}>
         `;

@@ -17,13 +17,13 @@ import { parseTag } from "./studio_magnets_model.js";
 
 const FIELDS = {
   book: "book", tag: "tag", magnets: "design.magnets", length: "design.length_m", segment: "design.segment_m", min_gap: "design.min_gap_m",
-  speed: "rules.speed_mps", read_clearance: "rules.clearance_m", confusion: "rules.confusion", safe: "rules.wrong_way_safe", missing: "rules.survive_missing",
+  speed: "rules.speed_m_s", read_clearance: "rules.clearance_m", confusion: "rules.confusion", safe: "rules.wrong_way_safe", missing: "rules.survive_missing",
   clearance: "clearance_m", depth: "depth_m", lateral: "lateral_m", axis: "axis",
 };
 /** @type {import("../components/form.js").Values} */
 const START = {
   book: "", tag: "", "design.magnets": "3", "design.length_m": "4", "design.segment_m": "0.1", "design.min_gap_m": "0.5",
-  "rules.speed_mps": "13.4", "rules.clearance_m": "0.3", "rules.confusion": "0.001", "rules.wrong_way_safe": false, "rules.survive_missing": false,
+  "rules.speed_m_s": "13.4", "rules.clearance_m": "0.3", "rules.confusion": "0.001", "rules.wrong_way_safe": false, "rules.survive_missing": false,
   clearance_m: "0.16", depth_m: "0", lateral_m: "0", axis: "x",
 };
 

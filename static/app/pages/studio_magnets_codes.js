@@ -63,7 +63,7 @@ export function CodebookForm({ schema, typed, books, codes, text, valid, reload 
           ${field("design.min_gap_m", { label: t("magnets.min_gap"), hint: "" })}
         </${Group}>
         <${Group} title=${t("magnets.rules")}>
-          ${field("rules.speed_mps", { label: t("magnets.speed"), hint: t("form.range", { least: 0.5, most: 70 }) })}
+          ${field("rules.speed_m_s", { label: t("magnets.speed"), hint: t("form.range", { least: 0.5, most: 70 }) })}
           ${field("rules.clearance_m", { label: t("magnets.read_clearance"), hint: t("form.range", { least: 0.05, most: 1 }) })}
           ${field("rules.confusion", { label: t("magnets.confusion"), hint: t("magnets.confusion_hint") })}
           <${CheckField} form=${form} path="rules.wrong_way_safe" label=${t("magnets.wrong_way_safe")} />
@@ -125,7 +125,7 @@ export function Capacity({ codes }) {
         [t("magnets.safe"), number(figures.wrong_way_safe_capacity)],
         [t("magnets.mean_worst"), `${number(apart.mean_accuracy * 100, 2, "%")} / ${number(apart.worst_accuracy * 100, 2, "%")}`],
         [t("magnets.format"), t("magnets.format_of", { magnets: design.magnets, length: number(design.length_m, 1, "m"), segment: number(design.segment_m, 2, "m") })],
-        [t("magnets.rules"), rules && t("magnets.rules_of", { speed: number(rules.speed_mps, 1, "m/s"), clearance: number(rules.clearance_m, 2, "m"), confusion: String(rules.confusion) })],
+        [t("magnets.rules"), rules && t("magnets.rules_of", { speed: number(rules.speed_m_s, 1, "m/s"), clearance: number(rules.clearance_m, 2, "m"), confusion: String(rules.confusion) })],
         [t("magnets.checks"), rules && [rules.wrong_way_safe && t("magnets.wrong_way_safe"), rules.survive_missing && t("magnets.survive_missing"), t("magnets.confusion_check")].filter(Boolean).join("; ")],
       ]} />
       ${list.length > 0 && html`

@@ -29,7 +29,7 @@ function placeOf(values) {
   return {
     clearance: Math.min(Math.max(of("clearance_m", 0.16), 0.05), 1), depth: Math.min(Math.max(of("depth_m", 0), 0), 0.3),
     lateral: Math.min(Math.max(of("lateral_m", 0), -2), 2), axis: String(values.axis),
-    speed: Math.min(Math.max(of("rules.speed_mps", 13.4), 0.5), 70),
+    speed: Math.min(Math.max(of("rules.speed_m_s", 13.4), 0.5), 70),
   };
 }
 

@@ -49,7 +49,7 @@ function TagForm({ schema, books }) {
       </${Group}>
       <${TextField} form=${shown} path="line" label=${t("magnets.line")} hint=${t("magnets.line_hint")} rows=${4} placeholder=${"-84.4800, 42.7263\n-84.4776, 42.7263"} required />
       <${Group} title=${t("magnets.traffic")}>
-        ${field("site.design_speed_mps", { placeholder: "13.4" })}
+        ${field("site.design_speed_m_s", { placeholder: "13.4" })}
         ${field("site.stop_line_chainage_m")}
         ${field("road")}
       </${Group}>

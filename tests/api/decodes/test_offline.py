@@ -188,13 +188,13 @@ def test_packets_give_the_same_verdicts_markers_and_lane(real_server: LiveServer
     assert not localization_warnings
     driven = datetime.fromtimestamp(float(np.median([p.received_at_s for p in packets])), UTC)
     then = move_to_epoch(merged.lon_deg, merged.lat_deg, decimal_year(datetime.now(UTC)), decimal_year(driven))
-    used = (merged.number, then.lon_deg, then.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_km_h)
+    used = (merged.number, then.lon_deg, then.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh)
     lane = fit_lane(LaneMarkers(*used), files.track)
     stations = online["lane"]["stations"]
     # within 2 mm: the path's weights are those of accuracies rounded up to the millimetre
     assert np.allclose(lane.lon_deg, stations["lon_deg"], rtol=0, atol=2e-8)
     assert np.allclose(lane.lat_deg, stations["lat_deg"], rtol=0, atol=2e-8)
-    assert np.allclose(lane.speed_limit_km_h, stations["speed_limit_km_h"])
+    assert np.allclose(lane.speed_limit_kmh, stations["speed_limit_kmh"])
 
     # the keys are the operator's to hand out: they are not in the file, and without them no packet is believed
     content = zlib.decompress(answer[104:-64])
@@ -212,7 +212,7 @@ def _codebook(client: httpx.Client) -> dict[str, Any]:
     body = {
         "name": "streets",
         "design": {"magnets": 3, "length_m": 4.0, "segment_m": 0.1},
-        "rules": {"speed_mps": 13.4, "clearance_m": 0.3, "confusion": 0.001},
+        "rules": {"speed_m_s": 13.4, "clearance_m": 0.3, "confusion": 0.001},
         "meanings": [{"kind": "bend-right", "value": angle} for angle in (30, 60, 125)],
     }
     answer = client.post("/v1/codebooks", json=body)

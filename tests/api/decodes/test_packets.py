@@ -127,7 +127,7 @@ def test_a_drive_gives_the_lane_its_pictures_and_observations(road: tuple[httpx.
     lane = found["lane"]
     assert lane["localization_grade"] == "cm", lane["localization_warnings"]
     assert lane["refusal"] is None
-    assert lane["speed_limits_km_h"] == [30.0]
+    assert lane["speed_limits_kmh"] == [30.0]
     lengths = {name: len(column) for name, column in lane["stations"].items()}
     assert set(lengths.values()) == {lengths["station_m"]}
     assert min(lane["stations"]["confidence"]) > 0.5

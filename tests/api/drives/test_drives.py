@@ -251,8 +251,8 @@ def test_positions_of_the_receiver_are_used_and_gated(server: LiveServer, client
     by_decode = {entry["decode_id"]: entry for entry in drive["report"]["receivers"]}
     assert list(by_decode) == logs
     assert (by_decode[logs[0]]["used"], by_decode[logs[0]]["left_out"]) == (12, 0)
-    assert by_decode[logs[0]]["stated_m"] == by_decode[logs[0]]["believed_m"] == 1.0
-    assert by_decode[logs[1]]["believed_m"] > 4.0
+    assert by_decode[logs[0]]["stated_m"] == by_decode[logs[0]]["assumed_m"] == 1.0
+    assert by_decode[logs[1]]["assumed_m"] > 4.0
     assert all(marker["used"] for marker in drive["report"]["markers"] if marker["family"] != "cerpm")
     warned = "\n".join(drive["report"]["warnings"])
     assert f"decode {logs[1]} are further from the markers" in warned

@@ -15,7 +15,7 @@ DESIGN = {"magnets": 3, "length_m": 4.0, "segment_m": 0.1}
 
 @pytest.mark.slow
 def test_a_draft_has_the_figures_and_first_codes_of_the_codebook(client: httpx.Client) -> None:
-    rules = {"speed_mps": 20.0, "clearance_m": 0.25, "wrong_way_safe": True}
+    rules = {"speed_m_s": 20.0, "clearance_m": 0.25, "wrong_way_safe": True}
     response = client.post(URL, json={"design": DESIGN, "rules": rules})
     assert response.status_code == 200, response.text
     draft = response.json()

@@ -36,7 +36,7 @@ def _codes(book: dict[str, Any]) -> list[str]:
 
 @pytest.mark.slow
 def test_a_codebook_gives_codes_to_meanings(client: httpx.Client) -> None:
-    rules = {"speed_mps": 13.4, "clearance_m": 0.3, "confusion": 0.0001, "wrong_way_safe": True}
+    rules = {"speed_m_s": 13.4, "clearance_m": 0.3, "confusion": 0.0001, "wrong_way_safe": True}
     response = client.post(
         "/v1/codebooks", json={"name": "City", "design": DESIGN, "rules": rules, "meanings": MEANINGS}
     )
@@ -65,7 +65,7 @@ def test_figures_say_what_fits(client: httpx.Client) -> None:
     assert figures["capacity_under_rules"] == 200
     assert figures["capacity_is_exact"] is False
     assert figures["distinguishable"]["codes"] <= figures["coupled_capacity"]
-    coarse = _new_codebook(client, name="Motorway", rules={"speed_mps": 31.0, "clearance_m": 0.4})["figures"]
+    coarse = _new_codebook(client, name="Motorway", rules={"speed_m_s": 31.0, "clearance_m": 0.4})["figures"]
     assert coarse["capacity_is_exact"] is True
     assert coarse["capacity_under_rules"] < figures["capacity_under_rules"]
     assert coarse["distinguishable"]["worst_accuracy"] < figures["distinguishable"]["worst_accuracy"]
@@ -192,8 +192,8 @@ def test_repeated_and_simultaneous_requests(client: httpx.Client) -> None:
         ({"design": DESIGN | {"segment_m": 0.100001}}, "design.segment_m"),
         ({"design": DESIGN | {"min_gap_m": 0.4}}, "design.min_gap_m"),
         ({"design": DESIGN | {"min_gap_m": 5}}, "design.min_gap_m"),
-        ({"rules": {"speed_mps": 0}}, "rules.speed_mps"),
-        ({"rules": {"speed_mps": 71}}, "rules.speed_mps"),
+        ({"rules": {"speed_m_s": 0}}, "rules.speed_m_s"),
+        ({"rules": {"speed_m_s": 71}}, "rules.speed_m_s"),
         ({"rules": {"clearance_m": 1.1}}, "rules.clearance_m"),
         ({"rules": {"confusion": 0}}, "rules.confusion"),
         ({"rules": {"confusion": 0.5}}, "rules.confusion"),

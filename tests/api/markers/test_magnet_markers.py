@@ -171,7 +171,7 @@ def _checks(marker: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def test_soft_limits_are_warnings(client: httpx.Client, lane: Lane) -> None:
-    site = {"design_speed_mps": 13.4, "stop_line_chainage_m": 100.0, "vehicles": ["sedan", "heavy truck"]}
+    site = {"design_speed_m_s": 13.4, "stop_line_chainage_m": 100.0, "vehicles": ["sedan", "heavy truck"]}
     marker = created(client, "/v1/markers", **_tag(lane(), 50.0) | {"site": site})
     checks = _checks(marker)
     reaction = checks["reaction-distance"]
@@ -281,8 +281,8 @@ _TAG = {"code": "SNS_4_0.1_10-30", "chainage_m": 10}
         ({"tag": None, "line": {"style": "solid", "spacing_m": 1e-300}}, "invalid-parameter", "line.to_m"),
         ({"tag": None, "line": {"style": "solid", "from_m": 9, "to_m": 9}}, "invalid-parameter", "line.to_m"),
         ({"tag": None, "line": {"style": "solid", "to_m": 400}}, "invalid-parameter", "line.to_m"),
-        ({"site": {"design_speed_mps": 100}}, "invalid-parameter", "site.design_speed_mps"),
-        ({"site": {"stop_line_chainage_m": 100}}, "invalid-parameter", "site.design_speed_mps"),
+        ({"site": {"design_speed_m_s": 100}}, "invalid-parameter", "site.design_speed_m_s"),
+        ({"site": {"stop_line_chainage_m": 100}}, "invalid-parameter", "site.design_speed_m_s"),
         ({"site": {"vehicles": ["tank"]}}, "invalid-parameter", "site.vehicles"),
         ({"site": {"readable_clearance_m": 2}}, "invalid-parameter", "site.readable_clearance_m"),
         ({"heading_deg": 10}, "invalid-parameter", "heading_deg"),

@@ -33,7 +33,7 @@ def test_more_markers_lose_more_packets(client: httpx.Client) -> None:
 
 
 def test_settings_are_recommended(client: httpx.Client) -> None:
-    body = {"design_speed_mps": 13.4, "recommend": True}
+    body = {"design_speed_m_s": 13.4, "recommend": True}
     advice = client.post(URL, json=body).json()["recommendation"]
     assert advice["radio"]["bandwidth_hz"] == 500_000  # nothing narrower is lawful for a fixed beacon
     assert advice["sentence"]
@@ -60,7 +60,7 @@ def test_a_reader_may_check(server: LiveServer) -> None:
         ({"radio": {"bandwidth_hz": 1}}, "bandwidth_hz"),
         ({"radio": {"interval_s": 0.001}}, "interval_s"),
         ({"road": {"spacing_m": 0}}, "spacing_m"),
-        ({"design_speed_mps": 1000}, "design_speed_mps"),
+        ({"design_speed_m_s": 1000}, "design_speed_m_s"),
         ({"markers": {"chainage_m": [1.0], "offset_m": [1.0, 2.0]}}, "markers"),
         ({"battery": {"capacity_mah": -1}}, "capacity_mah"),
         ({"receiver": {"channels": 0}}, "channels"),

@@ -81,13 +81,13 @@ def drive(count: int = 6, **off: float) -> list[ReceivedPacket]:
 
 
 def test_rows_are_of_the_registry_or_the_newest_message() -> None:
-    known = {1: RegisteredMarker(*place(1), side=LaneSide.RIGHT, speed_limit_km_h=80.0, sigma_m=0.05)}
+    known = {1: RegisteredMarker(*place(1), side=LaneSide.RIGHT, speed_limit_kmh=80.0, sigma_m=0.05)}
     merged = merge_markers(heard(*drive(2), say(2, 110, 5, east_m=0.1)), known, track())
     assert merged.number.tolist() == [1, 2]
     assert (merged.lon_deg[0], merged.lat_deg[0]) == place(1)
     assert merged.lon_deg[1] == pytest.approx(place(2)[0] + 0.1 * M_EAST, abs=1e-7)
     assert merged.side.tolist() == [LaneSide.RIGHT, LaneSide.LEFT]
-    assert merged.speed_limit_km_h.tolist() == [80.0, 50.0]
+    assert merged.speed_limit_kmh.tolist() == [80.0, 50.0]
     assert merged.sigma_m.tolist() == [0.05, 0.02]
     assert merged.packets.tolist() == [2, 3]
     assert merged.registered.tolist() == [True, False]

@@ -45,9 +45,9 @@ def read_tag(tag: InformationTag, at: ReadingConditions, count: int, seed: int) 
     rng = np.random.default_rng(seed)
     gaps = np.array(tag.gaps_m)
     places = np.array(tag.offsets_m) + rng.normal(
-        0, at.model.position_std_m(at.speed_mps, at.clearance_m), (count, tag.magnet_count)
+        0, at.model.position_std_m(at.speed_m_s, at.clearance_m), (count, tag.magnet_count)
     )
-    read = np.diff(places) + rng.normal(0, at.odometer.gap_std_m(gaps, at.speed_mps), (count, len(gaps)))
+    read = np.diff(places) + rng.normal(0, at.odometer.gap_std_m(gaps, at.speed_m_s), (count, len(gaps)))
     return np.cumsum(read, axis=1)[:, :-1] / read.sum(axis=1)[:, None]
 
 

@@ -34,7 +34,7 @@ def test_a_file_with_one_unnamed_line_is_one_lane() -> None:
     assert lane.centre is not None
     assert lane.centre[:, :2].tolist() == LINE
     assert np.isnan(lane.centre[:, 2]).all()
-    assert (lane.speed_limit_mps, lane.width_m, lane.road, file.crs) == (None, None, None, None)
+    assert (lane.speed_limit_m_s, lane.width_m, lane.road, file.crs) == (None, None, None, None)
     assert lane.left_style is BoundaryStyle.UNKNOWN
 
 
@@ -52,9 +52,9 @@ def test_properties_of_a_lane() -> None:
     assert (first.name, first.road, second.name) == ("A", "B10", "2")
     assert first.width_m is not None
     assert first.width_m.tolist() == [3.2] * 3
-    assert first.speed_limit_mps == pytest.approx(np.full(3, 80 / 3.6))
+    assert first.speed_limit_m_s == pytest.approx(np.full(3, 80 / 3.6))
     assert (first.left_style, first.right_style) == (BoundaryStyle.SOLID, BoundaryStyle.DASHED)
-    assert second.speed_limit_mps == pytest.approx(np.full(2, 30 * 0.44704))
+    assert second.speed_limit_m_s == pytest.approx(np.full(2, 30 * 0.44704))
     assert second.centre is not None
     assert np.isnan(second.centre[0, 2])
     assert second.centre[1, 2] == 112.0
@@ -73,7 +73,7 @@ def test_properties_of_a_lane() -> None:
     ],
 )
 def test_speeds(properties: dict[str, Any], speed_kmh: float | None) -> None:
-    speed = _read(_feature(LINE, **properties)).lanes[0].speed_limit_mps
+    speed = _read(_feature(LINE, **properties)).lanes[0].speed_limit_m_s
     if speed_kmh is None:
         assert speed is None
     else:
@@ -86,7 +86,7 @@ def test_properties_of_the_collection_hold_for_all_features() -> None:
     assert file.crs == "EPSG:4326"
     assert [lane.road for lane in file.lanes] == ["route", "route"]
     assert file.lanes[0].width_m == pytest.approx(np.full(3, 3.3))
-    speeds = [lane.speed_limit_mps[0] for lane in file.lanes if lane.speed_limit_mps is not None]
+    speeds = [lane.speed_limit_m_s[0] for lane in file.lanes if lane.speed_limit_m_s is not None]
     assert speeds == pytest.approx([25 * 0.44704, 30 / 3.6])
 
 
@@ -100,8 +100,8 @@ def test_boundaries_are_one_lane(left: str, right: str) -> None:
     assert lane.right is not None
     assert (len(lane.left), len(lane.right)) == (3, 2)
     assert lane.left_style is BoundaryStyle.DASHED
-    assert lane.speed_limit_mps is not None
-    assert len(lane.speed_limit_mps) == 3
+    assert lane.speed_limit_m_s is not None
+    assert len(lane.speed_limit_m_s) == 3
 
 
 def test_lanes_of_two_roads_may_have_the_same_number() -> None:
@@ -123,7 +123,7 @@ def test_parts_are_joined_where_they_meet_in_any_order() -> None:
 def test_features_of_one_lane_are_joined_with_their_values() -> None:
     file = _read(_feature(LINE[1:], lane="a", maxspeed=30), _feature(LINE[:2], lane="a", maxspeed=50))
     (lane,) = file.lanes
-    assert lane.speed_limit_mps == pytest.approx(np.array([50, 50, 30]) / 3.6)
+    assert lane.speed_limit_m_s == pytest.approx(np.array([50, 50, 30]) / 3.6)
 
 
 def test_parts_across_the_antimeridian_are_joined() -> None:
@@ -281,8 +281,8 @@ def test_a_route_of_a_published_map() -> None:
     assert lane.road == "karlsruhe_moderate_1"
     assert lane.left is not None
     assert lane.left[:, 0].mean() == pytest.approx(8.416, abs=0.005)
-    assert lane.speed_limit_mps is not None
-    assert lane.speed_limit_mps[0] == pytest.approx(30 * 0.44704)
+    assert lane.speed_limit_m_s is not None
+    assert lane.speed_limit_m_s[0] == pytest.approx(30 * 0.44704)
     assert lane.width_m is None
     assert file.crs == "EPSG:4326"
     assert not math.isnan(lane.left[0, 0])

@@ -108,7 +108,7 @@ def test_successive_lanelets_are_one_lane_with_styles_and_heights() -> None:
     np.testing.assert_allclose(values(lane.right)[:, 2], [12.5, np.nan, np.nan])
     # Of both double lines the dashed one is nearer to the lane: one is stored westwards.
     assert (lane.left_style, lane.right_style) == (BoundaryStyle.DASHED, BoundaryStyle.DASHED)
-    assert lane.speed_limit_mps is None
+    assert lane.speed_limit_m_s is None
 
 
 @pytest.mark.parametrize(
@@ -145,15 +145,15 @@ def test_a_ring_is_one_lane() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "speed_mps"),
+    ("text", "speed_m_s"),
     [("50", 50 / 3.6), ("50 km/h", 50 / 3.6), ("30mph", 13.4112), ("13.9 m/s", 13.9), ("de274-70", 70 / 3.6)],
 )
 @pytest.mark.parametrize("regulatory", [False, True])
-def test_speed_limits(text: str, speed_mps: float, regulatory: bool) -> None:
+def test_speed_limits(text: str, speed_m_s: float, regulatory: bool) -> None:
     member, opening = rule(30, subtype="speed_limit", sign_type=text)
     limited = lanelet(21, 12, 13, member) if regulatory else lanelet(21, 12, 13, speed_limit=text)
     (lane,) = read_lanelet2(osm(NODES, WAYS, lanelet(20, 10, 11), limited, opening + "</relation>")).lanes
-    np.testing.assert_allclose(values(lane.speed_limit_mps), [np.nan, speed_mps, speed_mps])
+    np.testing.assert_allclose(values(lane.speed_limit_m_s), [np.nan, speed_m_s, speed_m_s])
 
 
 def test_speed_limit_by_a_sign_and_one_that_is_not_understood() -> None:
@@ -161,9 +161,9 @@ def test_speed_limit_by_a_sign_and_one_that_is_not_understood() -> None:
     sign = way(40, 0, 3, type="traffic_sign", subtype="de274-30")
     refers = '<member type="way" ref="40" role="refers"/></relation>'
     (lane,) = read_lanelet2(osm(NODES, WAYS, sign, lanelet(20, 10, 11, member), opening + refers)).lanes
-    np.testing.assert_allclose(values(lane.speed_limit_mps), 30 / 3.6)
+    np.testing.assert_allclose(values(lane.speed_limit_m_s), 30 / 3.6)
     file = read_lanelet2(osm(NODES, WAYS, lanelet(20, 10, 11, speed_limit="walk")))
-    assert file.lanes[0].speed_limit_mps is None
+    assert file.lanes[0].speed_limit_m_s is None
     assert file.warnings == ("Lanelet 20: the speed limit 'walk' is not understood.",)
 
 
@@ -254,7 +254,7 @@ def test_a_lane_whose_boundaries_meet_begins_where_they_are_apart(at_end: bool) 
     ends = (values(lane.right)[[0, -1], 0] - 8) * DEGREE_M
     assert ends.tolist() == pytest.approx([100.0, 58.4] if at_end else [58.4, 100.0], abs=0.3)
     assert values(lane.left)[[0, -1], 2].tolist() == pytest.approx([3.0, 2.17] if at_end else [2.17, 3.0], abs=0.01)
-    np.testing.assert_allclose(values(lane.speed_limit_mps), 50 / 3.6)
+    np.testing.assert_allclose(values(lane.speed_limit_m_s), 50 / 3.6)
     assert "Lanelet 20: its boundaries meet at an end" in file.warnings[0]
 
 

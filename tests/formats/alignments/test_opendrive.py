@@ -278,12 +278,12 @@ def test_speed_limits_of_roads_and_lanes() -> None:
     slow = LANE.format(-1, "").replace("</lane>", '<speed sOffset="60" max="5"/></lane>')
     file = read_opendrive(document(road(extra=types, lanes=section(right=slow))))
     right, left = lanes(file)["road 7 lane -1"], lanes(file)["road 7 lane 1"]
-    speed, station = values(right.speed_limit_mps), values(right.station_m)
+    speed, station = values(right.speed_limit_m_s), values(right.station_m)
     mph = 30 * 0.44704
     np.testing.assert_allclose(speed[station < 39.9], 70 / 3.6)
     np.testing.assert_allclose(speed[(station > 40.1) & (station < 59.9)], mph)
     np.testing.assert_allclose(speed[station > 60.1], 5.0)
-    np.testing.assert_allclose(values(left.speed_limit_mps)[[0, -1]], [mph, 70 / 3.6])
+    np.testing.assert_allclose(values(left.speed_limit_m_s)[[0, -1]], [mph, 70 / 3.6])
     events = {(event.lane, event.value, round(event.point[0])) for event in file.events}
     assert events == {
         ("road 7 lane -1", 48.3, 40),

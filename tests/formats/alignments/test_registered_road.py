@@ -63,7 +63,7 @@ def test_lanes_lie_at_their_offsets_from_the_axis(start: tuple[float, float], dr
         found = np.array([foot[0].offset_m for foot in feet])
         assert np.abs(found - offsets[lane.name]).max() < 0.005
         assert lane.width_m == pytest.approx(3.25)
-        assert lane.design_speed_mps * 3.6 == pytest.approx(70)
+        assert lane.design_speed_m_s * 3.6 == pytest.approx(70)
         chainages = np.array([foot[0].chainage_m for foot in feet])
         assert np.all(np.diff(chainages) > 0) == lane.name.startswith("forward")
         # stations are chainages of the axis; in a wedge at a vertex the plain foot differs by centimetres

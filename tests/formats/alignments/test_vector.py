@@ -59,7 +59,7 @@ def test_layers_of_a_geopackage(tmp_path: Path) -> None:
     assert first.centre[:, 2].tolist() == [110.0] * 4
     assert first.width_m is not None
     assert second.width_m is None
-    assert second.speed_limit_mps == pytest.approx(np.full(4, 30 * 0.44704))
+    assert second.speed_limit_m_s == pytest.approx(np.full(4, 30 * 0.44704))
     (event,) = file.events
     assert (event.kind, event.lane, event.point) == (EventKind.STOP_LINE, "2", (456_010.0, 5_430_001.0))
     (area,) = file.areas

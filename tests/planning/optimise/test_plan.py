@@ -42,7 +42,7 @@ def sure(lane: Lane, at: Floats) -> tuple[Floats, Floats]:
 
 def slower_is_better(lane: Lane, at: Floats) -> tuple[Floats, Floats]:
     """A camera that gets more frames of a plate at lower speed: 99.5 % up to 60 km/h, 93 % at 100 km/h."""
-    speed_kmh = lane.value_at(lane.design_speed_mps, at) * 3.6
+    speed_kmh = lane.value_at(lane.design_speed_m_s, at) * 3.6
     return np.interp(speed_kmh, [60, 100], [0.995, 0.93]), np.full(len(at), 0.05)
 
 
@@ -91,7 +91,7 @@ def test_sure_plates_on_a_straight_are_as_many_as_the_windows_need() -> None:
 def test_unsure_plates_stand_twice_where_vehicles_are_fast() -> None:
     lane = straight(1200)
     speed = np.where(lane.chainage_m < 600, 60 / 3.6, 100 / 3.6)
-    lane = Lane(**{name: getattr(lane, name) for name in Lane.__slots__} | {"design_speed_mps": speed})
+    lane = Lane(**{name: getattr(lane, name) for name in Lane.__slots__} | {"design_speed_m_s": speed})
     plan = optimise(road(lane), rules_of(quality={"fix_every_m": 100}), plate=slower_is_better)
     assert least_probability(lane, plan, 100, plate=slower_is_better) >= 0.99 - 1e-9
     slow = [site for site in plan.sites if site.chainage_m < 600]

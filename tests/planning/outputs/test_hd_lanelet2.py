@@ -222,7 +222,7 @@ def test_a_lane_in_a_town_without_heights_or_stations(tmp_path: Path) -> None:
 
 def test_lanelets_whose_speed_is_unknown_have_no_limit(tmp_path: Path) -> None:
     lane = straight(120)
-    lane = replace(lane, design_speed_mps=np.where(lane.chainage_m < 50, 25.0, np.nan))
+    lane = replace(lane, design_speed_m_s=np.where(lane.chainage_m < 50, 25.0, np.nan))
     loaded = load(tmp_path, write_lanelet2(HdMap("speeds", (lane,), ())))
     tags = [lanelet.attributes for lanelet in loaded.laneletLayer]
     assert [found["speed_limit"] for found in tags if "speed_limit" in found] == ["90"]

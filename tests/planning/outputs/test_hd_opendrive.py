@@ -47,7 +47,7 @@ def hilly(lane: Lane) -> Lane:
         grade=np.gradient(height, x),
         superelevation_rad=np.clip(-lane.curvature_per_m * 4, -0.06, 0.06),
         width_m=3.5 + np.clip((x - 300) / 100, 0, 0.5),
-        design_speed_mps=np.where(x < 350, 25.0, 50 / 3.6),
+        design_speed_m_s=np.where(x < 350, 25.0, 50 / 3.6),
     )
 
 
@@ -206,7 +206,7 @@ def test_roads_that_continue_one_another_are_linked_unless_they_branch(schema: A
             field: getattr(whole, field)[cut]
             for field in (
                 "lon_deg", "lat_deg", "height_m", "heading_deg", "curvature_per_m", "grade", "superelevation_rad",
-                "width_m", "design_speed_mps", "station_m",
+                "width_m", "design_speed_m_s", "station_m",
             )
         }  # fmt: skip
         return replace(whole, name=name, chainage_m=whole.chainage_m[cut] - first, **values)
@@ -236,7 +236,7 @@ def test_signs_of_a_registry_without_heights(schema: Any) -> None:
 
 def test_a_lane_whose_speed_is_not_known_everywhere_has_none(schema: Any) -> None:
     lane = straight(100)
-    partly = replace(lane, name="2", design_speed_mps=np.where(lane.chainage_m < 50, 25.0, np.nan))
+    partly = replace(lane, name="2", design_speed_m_s=np.where(lane.chainage_m < 50, 25.0, np.nan))
     root = etree.fromstring(write_opendrive(HdMap("speeds", (lane, partly), ())))
     schema.assertValid(root)
     assert [len(list(element.iter("speed"))) for element in root.findall("road")] == [1, 0]
@@ -309,4 +309,4 @@ def test_our_own_reader_gets_the_lane_back_within_a_centimetre(radius_m: float) 
     assert again.value_at(again.superelevation_rad, x) == pytest.approx(
         lane.value_at(lane.superelevation_rad, x), abs=2e-3
     )
-    assert again.design_speed_mps[0] == pytest.approx(25.0)
+    assert again.design_speed_m_s[0] == pytest.approx(25.0)

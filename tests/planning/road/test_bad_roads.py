@@ -87,7 +87,7 @@ def test_a_closed_track_is_no_crossing() -> None:
 
 
 def test_speed_is_required() -> None:
-    lane = centre_lane([[0, 0], [50, 0], [100, 0]], "x", speed_limit_mps=np.array([10.0, np.nan, np.nan]))
+    lane = centre_lane([[0, 0], [50, 0], [100, 0]], "x", speed_limit_m_s=np.array([10.0, np.nan, np.nan]))
     with pytest.raises(
         InvalidParameter, match=r"lane x, chainage 5[01].0 m at 8\.4006\d+, 49.0000000: neither"
     ) as refused:

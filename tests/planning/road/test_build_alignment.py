@@ -131,7 +131,7 @@ def test_values_along_the_lane() -> None:
         curvature_per_m=np.zeros(4),
         superelevation_rad=np.array([0.0, 0.02, 0.02, 0.02]),
         width_m=np.array([3.0, 4.0, 4.0, 4.0]),
-        speed_limit_mps=np.array([10.0, 20.0, 20.0, 20.0]),
+        speed_limit_m_s=np.array([10.0, 20.0, 20.0, 20.0]),
         station_m=np.array([1000.0, 960.0, 960.0, 900.0]),
         road="A 5",
     )
@@ -145,16 +145,16 @@ def test_values_along_the_lane() -> None:
     assert built.value_at(built.station_m, [20.0, 70.0]) == pytest.approx([980.0, 930.0], abs=1e-4)
     assert built.value_at(built.height_m, 20.0) == pytest.approx(101.0, abs=1e-6)
     assert built.value_at(built.grade, [15.0, 80.0]) == pytest.approx([0.05, 0.0], abs=0.002)
-    assert built.design_speed_mps[[0, 39, 41, -1]].tolist() == [10.0, 10.0, 20.0, 20.0]
+    assert built.design_speed_m_s[[0, 39, 41, -1]].tolist() == [10.0, 10.0, 20.0, 20.0]
     (event,) = alignment.events
     assert (event.kind, event.value) == (EventKind.SPEED_LIMIT, 72.0)
     assert 40.0 <= event.chainage_m <= 41.0
 
 
 def test_what_the_file_leaves_open_comes_from_the_rules() -> None:
-    lane = centre_lane([[0, 0], [50, 0]], speed_limit_mps=np.full(2, 20.0))
-    assert _lane(lane).design_speed_mps[0] == 20.0
-    assert _lane(lane, override_speed=True).design_speed_mps[0] == pytest.approx(50 / 3.6)
+    lane = centre_lane([[0, 0], [50, 0]], speed_limit_m_s=np.full(2, 20.0))
+    assert _lane(lane).design_speed_m_s[0] == 20.0
+    assert _lane(lane, override_speed=True).design_speed_m_s[0] == pytest.approx(50 / 3.6)
     assert _lane(lane, lane_width_m=3.1).width_m[0] == 3.1
     assert build(lane).lanes[0].road == "road"
 

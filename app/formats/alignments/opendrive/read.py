@@ -21,7 +21,7 @@ from app.formats.alignments.geometry import (
     Floats,
     usable_crs,
 )
-from app.formats.alignments.opendrive.road import Grid, Road, Track, build_tracks, lane_edges, parse_road, speed_mps
+from app.formats.alignments.opendrive.road import Grid, Road, Track, build_tracks, lane_edges, parse_road, speed_m_s
 from app.formats.xml_tree import attribute, parse_xml
 
 # === What lies on an OpenDRIVE road: stop lines, crossings, speed limits, ends at junctions, bridges.
@@ -86,8 +86,8 @@ def _along(road: Road, track: Track) -> list[EventGeometry]:
     lane, found = track.geometry, []
     assert lane.centre is not None
     assert lane.station_m is not None
-    if lane.speed_limit_mps is not None:
-        speed = lane.speed_limit_mps
+    if lane.speed_limit_m_s is not None:
+        speed = lane.speed_limit_m_s
         for i in np.flatnonzero((speed[1:] != speed[:-1]) & np.isfinite(speed[1:])) + 1:
             found.append(_event(EventKind.SPEED_LIMIT, lane.centre[i], lane.name, round(speed[i] * 3.6, 1)))
     end = road.curve.end_s if track.forward else 0.0
@@ -118,11 +118,11 @@ def _signal(
     if kind is not EventKind.SPEED_LIMIT:
         return _at(kind, (s, s), holder, tracks)
     speed = ET.Element("speed", max=signal.get("value", ""), unit=signal.get("unit", _sign_unit(country)))
-    limit_mps = speed_mps(speed, place)
-    if math.isnan(limit_mps):
+    limit_m_s = speed_m_s(speed, place)
+    if math.isnan(limit_m_s):
         return []
     known = [(event.lane, event.point) for event in events if event.kind is kind]
-    found = _at(kind, (s, s), holder, tracks, round(limit_mps * 3.6, 1))
+    found = _at(kind, (s, s), holder, tracks, round(limit_m_s * 3.6, 1))
     return [
         event
         for event in found

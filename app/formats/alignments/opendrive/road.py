@@ -265,11 +265,11 @@ def _speeds(elements: list[ET.Element], place: str, start: float | None = None) 
     for element in elements:
         speed = element if start is not None else element.find("speed")
         s = attribute(element, "s", place, 0.0) if start is None else start + attribute(element, "sOffset", place, 0.0)
-        found.append((s, math.nan if speed is None else speed_mps(speed, place)))
+        found.append((s, math.nan if speed is None else speed_m_s(speed, place)))
     return sorted(found, key=lambda row: row[0])
 
 
-def speed_mps(speed: ET.Element, place: str) -> float:
+def speed_m_s(speed: ET.Element, place: str) -> float:
     if speed.get("max", "").strip() in ("", "no limit", "undefined"):
         return math.nan
     unit = speed.get("unit", "m/s").strip()
@@ -584,7 +584,7 @@ def _geometry(run: Floats, name: str, styles: tuple[BoundaryStyle, BoundaryStyle
         curvature_per_m=run[:, _K],
         superelevation_rad=run[:, _ROLL],
         width_m=run[:, _WIDTH],
-        speed_limit_mps=None if np.isnan(speed).all() else speed,
+        speed_limit_m_s=None if np.isnan(speed).all() else speed,
         station_m=run[:, _S],
         left_style=styles[0],
         right_style=styles[1],
