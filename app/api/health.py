@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from fastapi import Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from app.api.http.dependencies import AfterLink, Caller, MarkerId, PageSize, SentVersion, Text, use_case
 from app.api.http.permissions import READERS, SURVEYORS
@@ -14,7 +14,7 @@ from app.api.http.problems import problem_responses
 from app.api.http.responses import cursor_of, document_response, file_response, json_response, page_response
 from app.api.http.routes import Router
 from app.families import FamilyName
-from app.families.documents import Identifier
+from app.families.documents import Identifier, StrictModel
 from app.registry.health import ItemFilter
 from app.services.health.maintenance import HealthDocument, ItemStatus, MaintenanceItem, MaintenancePage, Outcome, What
 from app.services.health.maintenance import Maintenance as MaintenanceService
@@ -54,11 +54,10 @@ async def get_item_filter(
 Filtered = Annotated[ItemFilter, Depends(get_item_filter)]
 
 
-class ApprovalIn(BaseModel):
+class ApprovalIn(StrictModel):
     """What becomes of the marker of an item."""
 
     model_config = ConfigDict(
-        extra="forbid",
         json_schema_extra={"examples": [{"outcome": "suspect", "note": "seen by the patrol"}, {"outcome": "none"}]},
     )
 
@@ -69,14 +68,14 @@ class ApprovalIn(BaseModel):
     note: Text | None = Field(default=None, min_length=1, max_length=300)
 
 
-class DismissalIn(BaseModel):
-    """Why an item is dismissed."""
+class RejectionIn(StrictModel):
+    """Why an item of the work list or a damage report is rejected."""
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"note": "the marker was surveyed again and is in its place"}]}
+        json_schema_extra={"examples": [{"reason": "the marker was surveyed and is in its place"}]}
     )
 
-    note: Text = Field(min_length=1, max_length=300)
+    reason: Text = Field(min_length=1, max_length=300)
 
 
 @router.get("/maintenance", READERS, responses=document_response(MaintenancePage))
@@ -124,7 +123,7 @@ def get_maintenance_item(item_id: ItemId, caller: Caller, maintenance: Maintenan
 def approve_maintenance_item(
     item_id: ItemId, approval: ApprovalIn, caller: Caller, maintenance: Maintenance, version: SentVersion
 ) -> Response:
-    """Accept an item of the work list.
+    """Approve an item of the work list.
 
     Its marker is changed as chosen: a version in its history and an entry of the audit log.
 
@@ -133,15 +132,15 @@ def approve_maintenance_item(
     return json_response(maintenance.approve(caller, item_id, approval.outcome, approval.note, version))
 
 
-@router.post("/maintenance/{item_id}/dismiss", SURVEYORS, responses=document_response(MaintenanceItem, 404, 409))
-def dismiss_maintenance_item(
-    item_id: ItemId, dismissal: DismissalIn, caller: Caller, maintenance: Maintenance
+@router.post("/maintenance/{item_id}/reject", SURVEYORS, responses=document_response(MaintenanceItem, 404, 409))
+def reject_maintenance_item(
+    item_id: ItemId, rejection: RejectionIn, caller: Caller, maintenance: Maintenance
 ) -> Response:
     """Reject an item of the work list.
 
     With a reason. Its test starts again.
     """
-    return json_response(maintenance.dismiss(caller, item_id, dismissal.note))
+    return json_response(maintenance.reject(caller, item_id, rejection.reason))
 
 
 @router.get("/markers/{marker_id}/health", READERS, responses=document_response(HealthDocument, 404))

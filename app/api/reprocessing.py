@@ -79,7 +79,7 @@ def post_reprocessing(wanted: ReprocessingIn, caller: Caller, reprocessings: Ser
 
     When no other work waits.
 
-    The results are kept beside the current ones. Nothing changes until the reprocessing is accepted.
+    The results are kept beside the current ones. Nothing changes until the reprocessing is approved.
     """
     return created_response(
         reprocessings.create(caller, wanted.criteria()), False, path="/v1/reprocessings", status=202
@@ -146,13 +146,13 @@ def cancel_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reproce
     return json_response(reprocessings.cancel(caller, reprocessing_id))
 
 
-@router.post("/{reprocessing_id}/accept", ADMINS, responses=document_response(ReprocessingDocument, 404, 409))
-def accept_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
-    """Accept the results of a reprocessing.
+@router.post("/{reprocessing_id}/approve", ADMINS, responses=document_response(ReprocessingDocument, 404, 409))
+def approve_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
+    """Approve the results of a reprocessing.
 
     They become current. Those of before are kept: `GET /v1/decodes/{decode_id}/versions`.
     """
-    return json_response(reprocessings.accept(caller, reprocessing_id))
+    return json_response(reprocessings.approve(caller, reprocessing_id))
 
 
 @decode_versions.get("/{decode_id}/versions", EVERYBODY, responses=document_response(DecodeVersions, 404))

@@ -227,16 +227,16 @@ def reprocess(
     vehicle: Annotated[str | None, typer.Option(help="Id of a vehicle.")] = None,
     bbox: Annotated[str | None, typer.Option(help="Coarse positions in west,south,east,north. [deg]")] = None,
     report: Annotated[Path | None, typer.Option(help="File for the report as CSV.")] = None,
-    accept: Annotated[str | None, typer.Option(help="Id of a reprocessing to accept; nothing else is done.")] = None,
+    approve: Annotated[str | None, typer.Option(help="Id of a reprocessing to approve; nothing else is done.")] = None,
     server: ServerOption = _SERVER,
     key: KeyOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Have a server decode stored uploads again, and print what changed. Nothing changes before it is accepted."""
+    """Have a server decode stored uploads again, and print what changed. Nothing changes before it is approved."""
     box = _box(bbox) if bbox else None
     with _client(server, key) as client, Progress(quiet=as_json) as shown:
-        if accept is not None:
-            found = _checked(client.post(f"/v1/reprocessings/{accept}/accept"))
+        if approve is not None:
+            found = _checked(client.post(f"/v1/reprocessings/{approve}/approve"))
         else:
             wanted = {
                 "kinds": kind, "older_than": older_than, "since": since, "until": until, "vehicle_id": vehicle,

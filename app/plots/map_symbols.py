@@ -44,7 +44,7 @@ LOOKS = {
     "draft": Look(_WHITE, (140, 148, 155)),
     "checked": Look(_WHITE, (31, 120, 180), "dot"),
     "approved": Look((166, 219, 160), (20, 90, 50), "half"),
-    "dismissed": Look(_WHITE, (140, 148, 155), "cross"),
+    "rejected": Look(_WHITE, (140, 148, 155), "cross"),
 }
 """By name. The colours are Okabe and Ito's or darker than these, for readers who see red and green alike."""
 SHAPES = {

@@ -29,7 +29,7 @@ from app.registry.features import FeatureTable, Field
 from app.registry.spatial import Box, within_box
 from app.registry.vehicles import vehicle_uploads
 
-ITEM_STATES = ("open", "approved", "dismissed")
+ITEM_STATUSES = ("open", "approved", "rejected")
 
 # the tests of a marker, of a code that is not registered, or a vehicle's own errors: app/health/states.py
 marker_health = sa.Table(
@@ -79,7 +79,7 @@ maintenance_items = sa.Table(
     sa.Column("family", sa.String(16), nullable=False),
     sa.Column("code", sa.String(64)),
     sa.Column("what", sa.String(32), nullable=False),
-    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
     sa.Column("outcome", sa.String(16)),
     sa.Column("road", sa.String(200)),
     sa.Column("measure_m", sa.Double),
@@ -101,10 +101,10 @@ maintenance_items = sa.Table(
     sa.Column("updated_at", UtcTime, nullable=False),
     # the feature that GIS clients read, written with every change of the row
     sa.Column("feature", sa.Text, nullable=False),
-    one_of("state", ITEM_STATES),
+    one_of("status", ITEM_STATUSES),
     sa.Index("ix_maintenance_items_agency_id_id", "agency_id", "id"),
     sa.Index("ix_maintenance_items_agency_id_subject", "agency_id", "subject"),
-    sa.Index("ix_maintenance_items_agency_id_state_priority_id", "agency_id", "state", "priority", "id"),
+    sa.Index("ix_maintenance_items_agency_id_status_priority_id", "agency_id", "status", "priority", "id"),
     sqlite_autoincrement=True,
 )
 
@@ -280,8 +280,8 @@ class ItemRow(NamedTuple):
     family: str
     code: str | None
     what: str  # a fault, ``wrong-way-driver``, or ``reported`` by people
-    # `state`, `outcome`: open, approved or dismissed; and what was approved
-    state: str
+    # `status`, `outcome`: open, approved or rejected; and what was approved
+    status: str
     outcome: str | None
     road: str | None
     measure_m: float | None
@@ -309,7 +309,7 @@ class ItemFilter:
 
     road: str | None = None
     what: str | None = None
-    state: str | None = None
+    status: str | None = None
     family: str | None = None
     box: Box | None = None
     min_priority: float | None = None
@@ -318,7 +318,7 @@ class ItemFilter:
     @property
     def conditions(self) -> list[sa.ColumnElement[bool]]:
         """As SQL."""
-        equal = {"road": self.road, "what": self.what, "state": self.state, "family": self.family}
+        equal = {"road": self.road, "what": self.what, "status": self.status, "family": self.family}
         found = [
             _M[name] == value for name, value in {**equal, "marker_id": self.marker_id}.items() if value is not None
         ]
@@ -334,7 +334,7 @@ ITEM_FIELDS = (
     Field(
         "what", "string", _M.what, "missing, moved, cloned, wrong-way, fading, unregistered, wrong-way-driver, reported"
     ),
-    Field("status", "string", _M.state, "open, approved or dismissed"),
+    Field("status", "string", _M.status, "open, approved or rejected"),
     Field("outcome", "string", _M.outcome, "What was approved: suspect, retired, resurvey or none"),
     Field("priority", "number", _M.priority, "0 to 1, the most urgent first"),
     Field("marker_id", "string", _M.marker_id, "Id of the marker"),
@@ -371,7 +371,7 @@ def get_item(connection: sa.Connection, agency_id: str, item_id: str) -> ItemRow
 
 def find_open(connection: sa.Connection, agency_id: str, subject: str, what: str) -> ItemRow | None:
     """The open item of a subject and a fault."""
-    query = _ITEMS.where(_M.agency_id == agency_id, _M.subject == subject, _M.what == what, _M.state == "open")
+    query = _ITEMS.where(_M.agency_id == agency_id, _M.subject == subject, _M.what == what, _M.status == "open")
     return find_one(connection, query.limit(1), ItemRow)
 
 
@@ -414,7 +414,7 @@ def change_item(connection: sa.Connection, agency_id: str, row: ItemRow, changes
 
 def _feature(row: ItemRow) -> str:
     """The item as a GeoJSON feature in one line."""
-    values = {**row._asdict(), "status": row.state}
+    values = row._asdict()
     return orjson.dumps(
         {
             "type": "Feature",

@@ -15,7 +15,7 @@ from app.registry.marker_rows import markers
 
 REPORT_KINDS = ("damaged", "dirty", "missing", "loose", "other")
 
-REPORT_STATES = ("new", "accepted", "rejected")
+REPORT_STATUSES = ("new", "approved", "rejected")
 
 # what an agency releases; without a row, `app.registry.public_pages.DEFAULT`
 public_pages = sa.Table(
@@ -40,18 +40,18 @@ damage_reports = sa.Table(
     sa.Column("language", sa.String(8), nullable=False),
     sa.Column("photo_key", sa.String(200)),
     sa.Column("photo_bytes", sa.BigInteger),
-    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
     sa.Column("note", sa.String(500)),
-    sa.Column("item_id", ID, sa.ForeignKey("maintenance_items.id")),  # that the report was accepted into
+    sa.Column("item_id", ID, sa.ForeignKey("maintenance_items.id")),  # that the report was approved into
     sa.Column("decided_by", sa.String(200)),
     sa.Column("decided_at", UtcTime),
     sa.Column("created_at", UtcTime, nullable=False),
     one_of("kind", REPORT_KINDS),
-    one_of("state", REPORT_STATES),
+    one_of("status", REPORT_STATUSES),
     sa.UniqueConstraint("marker_id", "form_nonce"),
     sa.Index("ix_damage_reports_agency_id_id", "agency_id", "id"),
-    sa.Index("ix_damage_reports_agency_id_state_id", "agency_id", "state", "id"),
-    sa.Index("ix_damage_reports_marker_id_state", "marker_id", "state"),
+    sa.Index("ix_damage_reports_agency_id_status_id", "agency_id", "status", "id"),
+    sa.Index("ix_damage_reports_marker_id_status", "marker_id", "status"),
 )
 
 # apart from the reports, so that it can be deleted without them
@@ -159,10 +159,10 @@ class StoredReport(NamedTuple):
     # `photo_key`, `photo_bytes`: blob of the photo
     photo_key: str | None
     photo_bytes: int | None
-    # `state`, `note`: new, accepted or rejected; and why
-    state: str
+    # `status`, `note`: new, approved or rejected; and why
+    status: str
     note: str | None
-    item_id: str | None  # item of the work list that it was accepted into
+    item_id: str | None  # item of the work list that it was approved into
     decided_by: str | None
     decided_at: datetime | None
     created_at: datetime
@@ -200,7 +200,7 @@ def find_sent(connection: sa.Connection, agency_id: str, marker_id: str, form_no
 def count_new(connection: sa.Connection, agency_id: str, marker_id: str | None = None) -> int:
     """Number of reports that nobody has decided on, of an agency or of one of its markers."""
     query = sa.select(sa.func.count()).select_from(damage_reports)
-    query = query.where(_R.agency_id == agency_id, _R.state == "new")
+    query = query.where(_R.agency_id == agency_id, _R.status == "new")
     if marker_id is not None:
         query = query.where(_R.marker_id == marker_id)
     return int(connection.execute(query).scalar_one())
@@ -223,12 +223,12 @@ def get_report(connection: sa.Connection, agency_id: str, report_id: str) -> Rep
 
 
 def list_reports(
-    connection: sa.Connection, agency_id: str, *, state: str | None = None, marker_id: str | None = None,
+    connection: sa.Connection, agency_id: str, *, status: str | None = None, marker_id: str | None = None,
     before: str | None = None, limit: int = 100,
 ) -> list[ReportRow]:  # fmt: skip
     """Reports, newest first."""
     query = _REPORTS.where(_R.agency_id == agency_id)
-    for column, value in ((_R.state, state), (_R.marker_id, marker_id)):
+    for column, value in ((_R.status, status), (_R.marker_id, marker_id)):
         if value is not None:
             query = query.where(column == value)
     if before is not None:

@@ -23,8 +23,8 @@ reprocessings = sa.Table(
     sa.Column("criteria", sa.JSON, nullable=False),
     sa.Column("decodes", sa.Integer, nullable=False),  # to be decoded again
     sa.Column("created_at", UtcTime, nullable=False),
-    sa.Column("accepted_at", UtcTime),
-    sa.Column("accepted_by", sa.String(200)),
+    sa.Column("approved_at", UtcTime),
+    sa.Column("approved_by", sa.String(200)),
     sa.Index("ix_reprocessings_agency_id_id", "agency_id", "id"),
 )
 
@@ -73,8 +73,8 @@ class ReprocessingRow(NamedTuple):
     criteria: dict[str, Any]
     decodes: int
     created_at: datetime
-    accepted_at: datetime | None = None
-    accepted_by: str | None = None
+    approved_at: datetime | None = None
+    approved_by: str | None = None
 
 
 class ReprocessedRow(NamedTuple):
@@ -190,7 +190,7 @@ def list_reprocessed(
     return fetch_all(connection, query.order_by(_R.decode_id).limit(limit), ReprocessedRow)
 
 
-def accept(connection: sa.Connection, reprocessing_id: str, who: str, now: datetime) -> int:
+def approve(connection: sa.Connection, reprocessing_id: str, who: str, now: datetime) -> int:
     """Make the new results current, and keep those of before. Returns their number."""
     mine = sa.and_(_R.reprocessing_id == reprocessing_id, _R.result.is_not(None))
     before = sa.select(
@@ -208,7 +208,7 @@ def accept(connection: sa.Connection, reprocessing_id: str, who: str, now: datet
     replaced = sa.select(_R.decode_id).where(mine)
     connection.execute(sa.update(decodes).where(_D.id.in_(replaced)).values(**new))
     own = sa.update(reprocessings).where(reprocessings.c.id == reprocessing_id)
-    connection.execute(own.values(accepted_at=now, accepted_by=who))
+    connection.execute(own.values(approved_at=now, approved_by=who))
     return kept
 
 

@@ -195,7 +195,7 @@ def _place(fix: Mapping[str, Any] | None) -> tuple[float, float] | None:
 # === Reprocessings as clients see them.
 
 
-State = Literal["running", "ready", "cancelled", "failed", "accepted"]
+State = Literal["running", "ready", "cancelled", "failed", "approved"]
 
 
 class ReprocessingSummary(TypedDict):
@@ -217,7 +217,7 @@ class ReprocessingLinks(TypedDict):
 
 
 class ReprocessingDocument(TypedDict):
-    """A reprocessing: its results are beside the current ones until it is accepted."""
+    """A reprocessing: its results are beside the current ones until it is approved."""
 
     id: str
     state: State
@@ -228,8 +228,8 @@ class ReprocessingDocument(TypedDict):
     shards: Annotated[dict[str, int], Field(description="Number of its jobs by state.")]
     summary: ReprocessingSummary
     created_at: datetime
-    accepted_at: datetime | None
-    accepted_by: str | None
+    approved_at: datetime | None
+    approved_by: str | None
     links: ReprocessingLinks
 
 
@@ -294,16 +294,16 @@ def reprocessing_document(row: ReprocessingRow, shards: dict[str, int], sums: di
             "failed": sums["failed"],
         },
         "created_at": row.created_at,
-        "accepted_at": row.accepted_at,
-        "accepted_by": row.accepted_by,
+        "approved_at": row.approved_at,
+        "approved_by": row.approved_by,
         "links": {"self": path, "report": f"{path}/report", "csv": f"{path}/report.csv"},
     }
 
 
 def state_of(row: ReprocessingRow, shards: dict[str, int]) -> State:
     """The state of a reprocessing, from those of its jobs."""
-    if row.accepted_at is not None:
-        return "accepted"
+    if row.approved_at is not None:
+        return "approved"
     if shards.get("queued") or shards.get("running"):
         return "running"
     if shards.get("cancelled"):
@@ -317,7 +317,7 @@ def reprocessed_document(row: ReprocessedRow) -> ReprocessedDecode:
     return {name: value for name, value in row._asdict().items() if name in names}  # type: ignore[return-value]
 
 
-# === Reprocessings: chosen, carried out in shards on the queue for archive work, reported, and accepted by a person.
+# === Reprocessings: chosen, carried out in shards on the queue for archive work, reported, and approved by a person.
 
 
 SHARD = 100
@@ -447,13 +447,13 @@ class Reprocessings:
             store.cancel_jobs(connection, caller.agency_id, reprocessing_id, self._clock())
             return self._document(connection, row)
 
-    def accept(self, caller: Caller, reprocessing_id: str) -> ReprocessingDocument:
+    def approve(self, caller: Caller, reprocessing_id: str) -> ReprocessingDocument:
         """Make the new results current; those of before are kept as versions of their decodes.
 
         Raises
         ------
         Conflict
-            It is not ready, it was accepted before, or a decode was reprocessed by another one since.
+            It is not ready, it was approved before, or a decode was reprocessed by another one since.
         """
         now = self._clock()
         with self._database.write(long=True) as connection:
@@ -470,8 +470,8 @@ class Reprocessings:
                     field="reprocessing_id",
                     cure="start another one",
                 )
-            count = store.accept(connection, reprocessing_id, caller.label, now)
-            log_change(connection, caller, "reprocessing.accepted", now=now, subject=reprocessing_id, decodes=count)
+            count = store.approve(connection, reprocessing_id, caller.label, now)
+            log_change(connection, caller, "reprocessing.approved", now=now, subject=reprocessing_id, decodes=count)
             return self._document(connection, REPROCESSINGS.get(connection, caller.agency_id, reprocessing_id))
 
     def versions(self, caller: Caller, decode_id: str) -> DecodeVersions:

@@ -76,8 +76,8 @@ class Tally:
 class PlaceErrors(NamedTuple):
     """A path at true places every 0.25 m that are beside it."""
 
-    # `off_m`, `confidence`, `sigma_m`, `curvature_off_per_m`: shape (N,): distance of the true centre line from the path,
-    # what the path reports there, and the error of its curvature
+    # `off_m`, `confidence`, `sigma_m`, `curvature_off_per_m`: shape (N,): distance of the true centre line from the
+    # path, what the path reports there, and the error of its curvature
     off_m: Floats
     confidence: Floats
     sigma_m: Floats

@@ -105,8 +105,8 @@ def test_stored_uploads_are_decoded_again(server: LiveServer, run: Callable[...,
     found = printed(done)
     assert found["state"] == "ready"
     assert report.read_text().startswith("decode_id,change,")
-    accepted = run("reprocess", "--accept", found["id"])
-    assert "accepted" in accepted.stdout
+    approved = run("reprocess", "--approve", found["id"])
+    assert "approved" in approved.stdout
 
 
 def test_artwork_is_drawn_and_fetched_with_progress(

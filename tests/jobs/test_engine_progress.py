@@ -61,4 +61,4 @@ def test_stored_uploads_are_decoded_again(server: LiveServer) -> None:
         wait_until(lambda: admin.get(path).json()["state"] != "running", "the reprocessing")
         run = admin.get(path).json()
         assert (run["state"], run["done"], run["summary"]["failed"]) == ("ready", 1, 0)
-        assert admin.post(f"{path}/accept").json()["state"] == "accepted"
+        assert admin.post(f"{path}/approve").json()["state"] == "approved"

@@ -80,7 +80,7 @@ def refer(connection: sa.Connection, agency_id: str, blobs: Blobs) -> set[str]:
         sa.insert(markers), {**marker, "original": {}, "localization_grade": "cm", "version": 1, **times}
     )
     report: dict[str, Any] = {**row, "marker_id": row["id"], "form_nonce": "", "kind": "other", "language": "en"}
-    connection.execute(sa.insert(damage_reports), {**report, "state": "new", "photo_key": keys[9], "created_at": NOW})
+    connection.execute(sa.insert(damage_reports), {**report, "status": "new", "photo_key": keys[9], "created_at": NOW})
     return set(keys)
 
 

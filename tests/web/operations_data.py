@@ -28,17 +28,17 @@ def send_report(
 
 
 def fill_operations(client: httpx.Client, forms: list[dict[str, Any]]) -> dict[str, str]:
-    """Send two damage reports, accept the first one, make the rest; returns ids by what they are of."""
+    """Send two damage reports, approve the first one, make the rest; returns ids by what they are of."""
     for form, (kind, text) in zip(forms, (("loose", "One corner is bent up."), ("dirty", "Mud")), strict=True):
         send_report(client, form, {"kind": kind, "text": text, "email": "walker@example.org"})
     second, first = client.get("/v1/damage-reports").json()["items"]
-    accepted = client.post(f"/v1/damage-reports/{first['id']}/accept", json={"note": "seen by the patrol"})
-    assert accepted.status_code == 200, accepted.text
+    approved = client.post(f"/v1/damage-reports/{first['id']}/approve", json={"note": "seen by the patrol"})
+    assert approved.status_code == 200, approved.text
     key = client.post("/v1/keys", json={"scope": "viewer", "label": "Fabricator", "expires_at": "2031-01-01T00:00:00Z"})
     webhook = client.post("/v1/webhooks", json={"url": "https://example.org/hooks/waymark", "events": ["job.*"]})
     for answer in (key, webhook):
         assert answer.status_code == 201, answer.text
     return {
-        "report": second["id"], "accepted_report": first["id"], "item": accepted.json()["item_id"],
+        "report": second["id"], "approved_report": first["id"], "item": approved.json()["item_id"],
         "key": key.json()["id"], "webhook": webhook.json()["id"],
     }  # fmt: skip

@@ -153,7 +153,7 @@ def test_a_photo_is_shown_and_a_report_accepted_into_the_work_list(
     page.locator(".panel img").wait_for()
     until(page, "document.querySelector('.panel img').naturalWidth === 80")
     page.get_by_label("Note").fill("send a crew")
-    page.get_by_role("button", name="Accept into the work list").click()
+    page.get_by_role("button", name="Approve for the work list").click()
     page.get_by_role("link", name="Item of the work list").click()
     page.wait_for_url("**/operations/maintenance/*")
     page.get_by_label("Decision").select_option("suspect")
@@ -165,17 +165,17 @@ def test_a_photo_is_shown_and_a_report_accepted_into_the_work_list(
     page.wait_for_url("**/markers?view=map&map=*")
 
 
-def test_the_work_list_is_exported_and_an_item_dismissed(watched: Watched, ids: dict[str, str]) -> None:
+def test_the_work_list_is_exported_and_an_item_rejected(watched: Watched, ids: dict[str, str]) -> None:
     page = watched.open(f"/operations/maintenance/{ids['item']}")
     with page.expect_download() as download:
         page.get_by_role("button", name="Export CSV").click()
     assert ids["item"] in Path(download.value.path()).read_text()
-    page.get_by_label("Decision").select_option("dismiss")
+    page.get_by_label("Decision").select_option("reject")
     page.get_by_label("Note").fill("it stands right")
-    page.get_by_role("button", name="Dismiss").click()
-    page.locator(".panel .facts", has_text="dismissed").wait_for()
-    page.locator("#filter-status").select_option("dismissed")
-    page.wait_for_url("**status=dismissed")
+    page.get_by_role("button", name="Reject").click()
+    page.locator(".panel .facts", has_text="rejected").wait_for()
+    page.locator("#filter-status").select_option("rejected")
+    page.wait_for_url("**status=rejected")
     page.locator("tbody tr", has_text="Reported by people").wait_for()
 
 
@@ -252,9 +252,9 @@ def test_stored_uploads_are_decoded_again(watched: Watched, server: LiveServer, 
     page.get_by_role("button", name="Start a reprocessing").click()
     page.get_by_role("dialog").get_by_role("button", name="Start a reprocessing").click()
     page.wait_for_url("**/operations/reprocessings/*")
-    page.get_by_role("button", name="Accept the new results").click()
-    page.get_by_role("dialog").get_by_role("button", name="Accept the new results").click()
-    page.locator(".panel .verdict", has_text="accepted").wait_for()
+    page.get_by_role("button", name="Approve the new results").click()
+    page.get_by_role("dialog").get_by_role("button", name="Approve the new results").click()
+    page.locator(".panel .verdict", has_text="approved").wait_for()
 
 
 # --- codebooks, webhooks, snapshots, settings -----------------------------------------------------------------------

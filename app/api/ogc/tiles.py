@@ -52,7 +52,7 @@ _LOOKS = {
         "draft": "draft", "checked": "checked", "proved": "checked", "approved": "approved", "committed": "planned",
         "built": "built", "surveyed": "surveyed",
     },
-    MAINTENANCE_ITEMS.id: {"open": "suspect", "approved": "approved", "dismissed": "dismissed"},
+    MAINTENANCE_ITEMS.id: {"open": "suspect", "approved": "approved", "rejected": "rejected"},
 }  # fmt: skip
 """Looks of the statuses that the features of a collection have; of the others, those of a marker's status."""
 _SMALLEST_ZOOM, _FULL_ZOOM = 6, 13  # symbols grow between them; on a map of a motorway

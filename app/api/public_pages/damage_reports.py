@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
+from app.api.health import RejectionIn
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, Version, use_case
 from app.api.http.permissions import ADMINS, READERS, SURVEYORS
 from app.api.http.problems import problem_responses
@@ -39,20 +40,12 @@ Service = Annotated[DamageReports, use_case(lambda cases: cases.damage_reports)]
 _PHOTO_HEADERS = {"Content-Security-Policy": "default-src 'none'; sandbox"}
 
 
-class AcceptanceIn(StrictModel):
+class ReportApprovalIn(StrictModel):
     """What the crew should know."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"note": "seen by the patrol"}, {}]})
 
     note: Text | None = Field(default=None, min_length=1, max_length=300)
-
-
-class RejectionIn(StrictModel):
-    """Why a report is rejected."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [{"reason": "the photo shows another marker"}]})
-
-    reason: Text = Field(min_length=1, max_length=300)
 
 
 @router.get("", READERS, responses=document_response(DamageReportPage))
@@ -69,7 +62,7 @@ def list_damage_reports(
 
     Newest first.
     """
-    page, last = reports.page(caller, state=status, marker_id=marker_id, before=after, limit=limit)
+    page, last = reports.page(caller, status=status, marker_id=marker_id, before=after, limit=limit)
     return page_response(request, page, after=last)
 
 
@@ -118,15 +111,17 @@ def delete_report_contact(report_id: ReportId, caller: Caller, reports: Service)
     return Response(status_code=204)
 
 
-@router.post("/{report_id}/accept", SURVEYORS, responses=document_response(DamageReport, 404, 409))
-def accept_damage_report(acceptance: AcceptanceIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
-    """Accept a damage report into the work list.
+@router.post("/{report_id}/approve", SURVEYORS, responses=document_response(DamageReport, 404, 409))
+def approve_damage_report(
+    approval: ReportApprovalIn, report_id: ReportId, caller: Caller, reports: Service
+) -> Response:
+    """Approve a damage report into the work list.
 
     In `/v1/maintenance` it is a new item, or the open one of the same marker.
 
     The marker does not change; that is decided with the item.
     """
-    return json_response(reports.accept(caller, report_id, acceptance.note))
+    return json_response(reports.approve(caller, report_id, approval.note))
 
 
 @router.post("/{report_id}/reject", SURVEYORS, responses=document_response(DamageReport, 404, 409))

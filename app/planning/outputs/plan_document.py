@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import orjson
@@ -191,6 +191,14 @@ def write_plan(plan: Plan) -> bytes:
     return document.model_dump_json(by_alias=True).encode()
 
 
+_FORMER_NAMES: Final = {  # of plans that earlier releases wrote
+    b'"design_speed_mps"': b'"design_speed_m_s"',
+    b'"deceleration_mps2"': b'"deceleration_m_s2"',
+    b'"speed_mps"': b'"speed_m_s"',
+    b'"quantum_mps"': b'"quantum_m_s"',
+}
+
+
 def read_plan(data: bytes) -> Plan:
     """The plan of a document that `write_plan` wrote.
 
@@ -201,6 +209,8 @@ def read_plan(data: bytes) -> Plan:
     """
     if len(data) > MAX_PLAN_BYTES:
         raise _unreadable(f"the plan has {len(data)} bytes", "plan", f"{MAX_PLAN_BYTES} bytes")
+    for old, new in _FORMER_NAMES.items():
+        data = data.replace(old, new)
     try:
         document = PlanDocument.model_validate_json(data)
     except ValidationError as error:

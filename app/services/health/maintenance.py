@@ -37,7 +37,7 @@ from app.services.ports import Clock
 # === The work list and the state of a marker's tests as clients see them.
 
 
-ItemStatus = Literal["open", "approved", "dismissed"]
+ItemStatus = Literal["open", "approved", "rejected"]
 Outcome = Literal["suspect", "retired", "resurvey", "none"]
 What = Literal["missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "wrong-way-driver", "reported"]
 
@@ -133,7 +133,7 @@ class HealthDocument(TypedDict):
 
 def item_document(row: ItemRow) -> MaintenanceItem:
     """An item as clients see it."""
-    return document_of(MaintenanceItem, row, status=row.state)
+    return document_of(MaintenanceItem, row)
 
 
 def health_document(marker_id: str, row: HealthRow | None, limits: Mapping[Fault, float]) -> HealthDocument:
@@ -303,7 +303,7 @@ def _new_item(
         family=place.family,
         code=marker.digits if marker is not None else reading.code if reading is not None else None,
         what=what,
-        state="open",
+        status="open",
         outcome=None,
         road=marker.road if marker is not None else None,
         measure_m=marker.measure_m if marker is not None else None,
@@ -364,7 +364,7 @@ def _upload(decode_id: str, frame: int, at: datetime, *, has_frames: bool) -> di
 def _event_detail(row: ItemRow) -> dict[str, object]:
     return {
         "what": row.what,
-        "status": row.state,
+        "status": row.status,
         "marker_id": row.marker_id,
         "road": row.road,
         "measure_m": row.measure_m,
@@ -481,7 +481,7 @@ class Maintenance:
                 change(connection)
             return self._decide(connection, caller, row, "approved", outcome, note, now)
 
-    def dismiss(self, caller: Caller, item_id: str, note: str) -> MaintenanceItem:
+    def reject(self, caller: Caller, item_id: str, reason: str) -> MaintenanceItem:
         """Reject a suspicion with a reason: its test starts again, and the item stays in the list of those decided.
 
         Raises
@@ -492,24 +492,30 @@ class Maintenance:
         now = self._clock()
         with self._database.write() as connection:
             row = _open_item(connection, caller, item_id)
-            return self._decide(connection, caller, row, "dismissed", None, note, now)
+            return self._decide(connection, caller, row, "rejected", None, reason, now)
 
     def _decide(
-        self, connection: sa.Connection, caller: Caller, row: ItemRow, state: str, outcome: Outcome | None,
-        note: str | None, now: datetime,
-    ) -> MaintenanceItem:  # fmt: skip
+        self,
+        connection: sa.Connection,
+        caller: Caller,
+        row: ItemRow,
+        status: Literal["approved", "rejected"],
+        outcome: Outcome | None,
+        note: str | None,
+        now: datetime,
+    ) -> MaintenanceItem:
         author = author_of(caller)
         decided = health.change_item(
             connection, caller.agency_id, row,
             {
-                "state": state, "outcome": outcome, "note": note, "decided_by": author.who, "decided_at": now,
+                "status": status, "outcome": outcome, "note": note, "decided_by": author.who, "decided_at": now,
                 "version": row.version + 1, "updated_at": now,
             },
         )  # fmt: skip
         _reset_test(connection, caller.agency_id, row, now)
         detail = {"what": row.what, "marker_id": row.marker_id, "outcome": outcome, "note": note}
         audit.record(
-            connection, caller.agency_id, author, f"maintenance.{state}", now=now, subject=row.id, detail=detail
+            connection, caller.agency_id, author, f"maintenance.{status}", now=now, subject=row.id, detail=detail
         )
         decided_event(connection, caller.agency_id, decided, now)
         return item_document(decided)
@@ -517,9 +523,9 @@ class Maintenance:
 
 def _open_item(connection: sa.Connection, caller: Caller, item_id: str) -> ItemRow:
     row = health.get_item(connection, caller.agency_id, item_id)
-    if row.state != "open":
+    if row.status != "open":
         raise Conflict(
-            f"the item was {row.state} before", field="item_id", limit="open items", cure="read it: GET it by its id"
+            f"the item was {row.status} before", field="item_id", limit="open items", cure="read it: GET it by its id"
         )
     return row
 

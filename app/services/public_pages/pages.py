@@ -106,7 +106,7 @@ class FormTokens:
 
 PublicField = Literal["code", "agency", "status", "revision", "road", "measure"]
 ReportKind = Literal["damaged", "dirty", "missing", "loose", "other"]
-ReportStatus = Literal["new", "accepted", "rejected"]
+ReportStatus = Literal["new", "approved", "rejected"]
 
 
 class ReportForm(TypedDict):
@@ -152,7 +152,7 @@ class PublicPageDocument(TypedDict):
 class DamageReport(TypedDict):
     """A damage report from a public page, and what a person decided.
 
-    `item_id` is the item of the work list that it was accepted into.
+    `item_id` is the item of the work list that it was approved into.
     """
 
     id: str
@@ -192,9 +192,7 @@ def public_page_document(row: PublicPageRow) -> PublicPageDocument:
 def damage_report_document(row: ReportRow) -> DamageReport:
     """A damage report as clients see it."""
     report = row.report
-    return document_of(
-        DamageReport, report, status=report.state, has_photo=report.photo_key is not None, has_contact=row.has_contact
-    )
+    return document_of(DamageReport, report, has_photo=report.photo_key is not None, has_contact=row.has_contact)
 
 
 def contact_document(row: ContactRow) -> ReportContact:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from typing import Literal
 
 import sqlalchemy as sa
 import structlog
@@ -123,7 +124,7 @@ class DamageReports:
             report = StoredReport(
                 id=new_id(now), agency_id=agency_id, marker_id=marker.id, form_nonce=sent.form_nonce, kind=sent.kind,
                 text=sent.text, language=sent.language, photo_key=key, photo_bytes=len(photo) if photo else None,
-                state="new", note=None, item_id=None, decided_by=None, decided_at=None, created_at=now,
+                status="new", note=None, item_id=None, decided_by=None, decided_at=None, created_at=now,
             )  # fmt: skip
             with self._database.write() as connection:
                 earlier = _check_new(connection, marker, sent)
@@ -146,12 +147,12 @@ class DamageReports:
     # --- of the agency ----------------------------------------------------------------------------------------------
 
     def page(
-        self, caller: Caller, *, state: str | None, marker_id: str | None, before: str | None, limit: int
+        self, caller: Caller, *, status: str | None, marker_id: str | None, before: str | None, limit: int
     ) -> tuple[DamageReportPage, str | None]:
         """A page of reports, newest first, and the id to continue before if there are more."""
         with self._database.read() as connection:
             rows = store.list_reports(
-                connection, caller.agency_id, state=state, marker_id=marker_id, before=before, limit=limit + 1
+                connection, caller.agency_id, status=status, marker_id=marker_id, before=before, limit=limit + 1
             )
         page = DamageReportPage(items=[damage_report_document(row) for row in rows[:limit]])
         return page, rows[limit - 1].report.id if len(rows) > limit else None
@@ -202,8 +203,8 @@ class DamageReports:
             store.delete_contact(connection, caller.agency_id, report_id)
             log_change(connection, caller, "damage-report.contact-deleted", now=now, subject=report_id)
 
-    def accept(self, caller: Caller, report_id: str, note: str | None) -> DamageReport:
-        """Accept a report into the work list: a new item of the marker, or one more report of the item that is open.
+    def approve(self, caller: Caller, report_id: str, note: str | None) -> DamageReport:
+        """Approve a report into the work list: a new item of the marker, or one more report of the item that is open.
 
         Raises
         ------
@@ -217,7 +218,7 @@ class DamageReports:
             item = open_reported_item(
                 connection, caller.agency_id, marker, report.id, report.kind, report.created_at, now
             )
-            return self._decide(connection, caller, report, "accepted", note, item.id, now)
+            return self._decide(connection, caller, report, "approved", note, item.id, now)
 
     def reject(self, caller: Caller, report_id: str, reason: str) -> DamageReport:
         """Reject a report with a reason.
@@ -232,16 +233,22 @@ class DamageReports:
             return self._decide(connection, caller, report, "rejected", reason, None, self._clock())
 
     def _decide(
-        self, connection: sa.Connection, caller: Caller, report: StoredReport, state: str, note: str | None,
-        item_id: str | None, now: datetime,
-    ) -> DamageReport:  # fmt: skip
+        self,
+        connection: sa.Connection,
+        caller: Caller,
+        report: StoredReport,
+        status: Literal["approved", "rejected"],
+        note: str | None,
+        item_id: str | None,
+        now: datetime,
+    ) -> DamageReport:
         agency_id = caller.agency_id
         store.change_report(
             connection, agency_id, report.id,
-            state=state, note=note, item_id=item_id, decided_by=caller.label, decided_at=now,
+            status=status, note=note, item_id=item_id, decided_by=caller.label, decided_at=now,
         )  # fmt: skip
         log_change(
-            connection, caller, f"damage-report.{state}", now=now, subject=report.id,
+            connection, caller, f"damage-report.{status}", now=now, subject=report.id,
             marker_id=report.marker_id, kind=report.kind, note=note, item_id=item_id,
         )  # fmt: skip
         row = store.get_report(connection, agency_id, report.id)
@@ -281,9 +288,9 @@ def _check_new(connection: sa.Connection, marker: PublicMarker, sent: SentReport
 
 def _undecided(connection: sa.Connection, caller: Caller, report_id: str) -> StoredReport:
     report = store.get_report(connection, caller.agency_id, report_id).report
-    if report.state != "new":
+    if report.status != "new":
         raise Conflict(
-            f"the report was {report.state} before", field="report_id", limit="new reports",
+            f"the report was {report.status} before", field="report_id", limit="new reports",
             cure=f"read it: GET /v1/damage-reports/{report_id}",
         )  # fmt: skip
     return report
@@ -301,4 +308,4 @@ def _photo_key(row: ReportRow) -> str:
 
 
 def _event_detail(report: StoredReport) -> dict[str, object]:
-    return {"marker_id": report.marker_id, "kind": report.kind, "status": report.state}
+    return {"marker_id": report.marker_id, "kind": report.kind, "status": report.status}

@@ -763,7 +763,7 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/damage-reports/{report_id}/accept": {
+    "/v1/damage-reports/{report_id}/approve": {
         parameters: {
             query?: never;
             header?: never;
@@ -772,8 +772,8 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Accept a damage report into the work list */
-        post: operations["accept_damage_report"];
+        /** Approve a damage report into the work list */
+        post: operations["approve_damage_report"];
         delete?: never;
         options?: never;
         head?: never;
@@ -1375,7 +1375,7 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Accept an item of the work list */
+        /** Approve an item of the work list */
         post: operations["approve_maintenance_item"];
         delete?: never;
         options?: never;
@@ -1383,7 +1383,7 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/maintenance/{item_id}/dismiss": {
+    "/v1/maintenance/{item_id}/reject": {
         parameters: {
             query?: never;
             header?: never;
@@ -1393,7 +1393,7 @@ export interface paths {
         get?: never;
         put?: never;
         /** Reject an item of the work list */
-        post: operations["dismiss_maintenance_item"];
+        post: operations["reject_maintenance_item"];
         delete?: never;
         options?: never;
         head?: never;
@@ -2071,7 +2071,7 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/reprocessings/{reprocessing_id}/accept": {
+    "/v1/reprocessings/{reprocessing_id}/approve": {
         parameters: {
             query?: never;
             header?: never;
@@ -2080,8 +2080,8 @@ export interface paths {
         };
         get?: never;
         put?: never;
-        /** Accept the results of a reprocessing */
-        post: operations["accept_reprocessing"];
+        /** Approve the results of a reprocessing */
+        post: operations["approve_reprocessing"];
         delete?: never;
         options?: never;
         head?: never;
@@ -2532,9 +2532,6 @@ export interface paths {
 export type webhooks = Record<string, never>;
 export interface components {
     schemas: {
-        AcceptanceIn: {
-            note?: string | null;
-        };
         AccuracyDocument: {
             asprs_2014: components["schemas"]["AsprsDocument"];
             asprs_2023: components["schemas"]["AsprsDocument"];
@@ -3341,7 +3338,7 @@ export interface components {
             marker_id: string;
             note: string | null;
             /** @enum {string} */
-            status: "new" | "accepted" | "rejected";
+            status: "new" | "approved" | "rejected";
             text: string | null;
         };
         DamageReportPage: {
@@ -3586,9 +3583,6 @@ export interface components {
             name: string;
             tolerance_mm: number | null;
             value_mm: number;
-        };
-        DismissalIn: {
-            note: string;
         };
         DistinguishableDocument: {
             accuracy: number;
@@ -4643,7 +4637,7 @@ export interface components {
             ratio: number;
             road: string | null;
             /** @enum {string} */
-            status: "open" | "approved" | "dismissed";
+            status: "open" | "approved" | "rejected";
             /** Format: date-time */
             updated_at: string;
             vehicles: number;
@@ -5892,6 +5886,9 @@ export interface components {
         RejectionIn: {
             reason: string;
         };
+        ReportApprovalIn: {
+            note?: string | null;
+        };
         ReportContact: {
             /** Format: date-time */
             created_at: string;
@@ -5923,8 +5920,8 @@ export interface components {
             same: number;
         };
         ReprocessingDocument: {
-            accepted_at: string | null;
-            accepted_by: string | null;
+            approved_at: string | null;
+            approved_by: string | null;
             /** Format: date-time */
             created_at: string;
             criteria: {
@@ -5937,7 +5934,7 @@ export interface components {
                 [key: string]: number;
             };
             /** @enum {string} */
-            state: "running" | "ready" | "cancelled" | "failed" | "accepted";
+            state: "running" | "ready" | "cancelled" | "failed" | "approved";
             summary: components["schemas"]["ReprocessingSummary"];
             total: number;
             who: string;
@@ -8240,7 +8237,7 @@ export interface operations {
                 after?: string | null;
                 limit?: number;
                 marker_id?: string | null;
-                status?: ("new" | "accepted" | "rejected") | null;
+                status?: ("new" | "approved" | "rejected") | null;
             };
             header?: never;
             path?: never;
@@ -8281,7 +8278,7 @@ export interface operations {
             };
         };
     };
-    accept_damage_report: {
+    approve_damage_report: {
         parameters: {
             query?: never;
             header?: never;
@@ -8292,7 +8289,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["AcceptanceIn"];
+                "application/json": components["schemas"]["ReportApprovalIn"];
             };
         };
         responses: {
@@ -9401,7 +9398,7 @@ export interface operations {
                 marker_id?: string | null;
                 min_priority?: number | null;
                 road?: string | null;
-                status?: ("open" | "approved" | "dismissed") | null;
+                status?: ("open" | "approved" | "rejected") | null;
                 what?: ("missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "wrong-way-driver" | "reported") | null;
             };
             header?: never;
@@ -9429,7 +9426,7 @@ export interface operations {
                 marker_id?: string | null;
                 min_priority?: number | null;
                 road?: string | null;
-                status?: ("open" | "approved" | "dismissed") | null;
+                status?: ("open" | "approved" | "rejected") | null;
                 what?: ("missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "wrong-way-driver" | "reported") | null;
             };
             header?: never;
@@ -9510,7 +9507,7 @@ export interface operations {
             };
         };
     };
-    dismiss_maintenance_item: {
+    reject_maintenance_item: {
         parameters: {
             query?: never;
             header?: never;
@@ -9521,7 +9518,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["DismissalIn"];
+                "application/json": components["schemas"]["RejectionIn"];
             };
         };
         responses: {
@@ -10803,7 +10800,7 @@ export interface operations {
             };
         };
     };
-    accept_reprocessing: {
+    approve_reprocessing: {
         parameters: {
             query?: never;
             header?: never;

@@ -1,4 +1,4 @@
-// The work list: faults that vehicles and people report, the most urgent first; approved or dismissed by a person.
+// The work list: faults that vehicles and people report, the most urgent first; approved or rejected by a person.
 
 import { html } from "htm/preact";
 import { useState } from "preact/hooks";
@@ -39,7 +39,7 @@ export default function Maintenance({ id }) {
     <button type="button" class="quiet" onClick=${() => save("geojson")}>${t("maintenance.geojson")}</button>
   `;
   const filters = html`
-    <${ChoiceFilter} name="status" label=${t("field.status")} otherwise="open" options=${[["open", t("option.open")], ["approved", t("option.approved")], ["dismissed", t("option.dismissed")], ["all", t("filter.all")]]} />
+    <${ChoiceFilter} name="status" label=${t("field.status")} otherwise="open" options=${[["open", t("option.open")], ["approved", t("option.approved")], ["rejected", t("option.rejected")], ["all", t("filter.all")]]} />
     <${ChoiceFilter} name="what" label=${t("field.what")} options=${[["", t("filter.all")], ...FAULTS.map((fault) => [fault, t(`fault.${fault}`)])]} />
     <${TextFilter} name="road" label=${t("field.road")} />
     <${ChoiceFilter} name="min_priority" label=${t("field.priority")} options=${[["", t("filter.all")], ["0.3", t("maintenance.soon")], ["0.6", t("maintenance.urgent")]]} />
@@ -128,21 +128,22 @@ function Upload({ upload }) {
 /** @param {{ item: Item, onDone: () => void }} props */
 function Decision({ item, onDone }) {
   const form = useForm({ outcome: item.marker_id ? "suspect" : "none", note: "" });
-  const dismiss = form.values.outcome === "dismiss";
+  const reject = form.values.outcome === "reject";
   const outcomes = item.marker_id ? OUTCOMES : /** @type {const} */ (["none"]);
   const submit = async () => {
     const note = String(form.values.note).trim();
-    const body = dismiss ? { note } : { outcome: form.values.outcome, ...(note ? { note } : {}) };
-    await request(`/v1/maintenance/${item.id}/${dismiss ? "dismiss" : "approve"}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-    notify(t(dismiss ? "maintenance.dismissed" : "maintenance.approved"));
+    const body = reject ? { reason: note } : { outcome: form.values.outcome, ...(note ? { note } : {}) };
+    await request(`/v1/maintenance/${item.id}/${reject ? "reject" : "approve"}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+    notify(t(reject ? "maintenance.rejected" : "maintenance.approved"));
     onDone();
   };
+  const errors = form.errors.reason ? { note: form.errors.reason, ...form.errors } : form.errors;
   return html`
     <h3>${t("maintenance.decide")}</h3>
-    <${FormFrame} form=${form} onSubmit=${submit} button=${t(dismiss ? "maintenance.dismiss" : "maintenance.approve")}>
-      <${SelectField} form=${form} path="outcome" label=${t("maintenance.outcome")} hint=${t(dismiss ? "maintenance.dismiss_hint" : "maintenance.approve_hint")}
-        options=${[...outcomes.map((name) => [name, t(`item_outcome.${name}`)]), ["dismiss", t("maintenance.no_fault")]]} />
-      <${TextField} form=${form} path="note" label=${t("field.note")} hint=${t("bulk.reason_hint")} required=${dismiss} />
+    <${FormFrame} form=${form} onSubmit=${submit} button=${t(reject ? "maintenance.reject" : "maintenance.approve")}>
+      <${SelectField} form=${form} path="outcome" label=${t("maintenance.outcome")} hint=${t(reject ? "maintenance.reject_hint" : "maintenance.approve_hint")}
+        options=${[...outcomes.map((name) => [name, t(`item_outcome.${name}`)]), ["reject", t("maintenance.no_fault")]]} />
+      <${TextField} form=${{ ...form, errors }} path="note" label=${t("field.note")} hint=${t("bulk.reason_hint")} required=${reject} />
     </${FormFrame}>
   `;
 }

@@ -1,4 +1,4 @@
-// Damage reports of the public pages: read them with their photo, accept them into the work list, or reject them.
+// Damage reports of the public pages: read them with their photo, approve them as items of the work list, or reject them.
 
 import { html } from "htm/preact";
 import { useState } from "preact/hooks";
@@ -19,7 +19,7 @@ import { may } from "../session.js";
 import { t, textOr } from "../texts/index.js";
 
 const BASE = "/operations/reports";
-const LEVELS = /** @type {const} */ ({ new: "warn", accepted: "good", rejected: "none" });
+const LEVELS = /** @type {const} */ ({ new: "warn", approved: "good", rejected: "none" });
 
 /** @typedef {import("../api/schema.js").components["schemas"]["DamageReport"]} Report */
 
@@ -27,7 +27,7 @@ const LEVELS = /** @type {const} */ ({ new: "warn", accepted: "good", rejected: 
 export default function Reports({ id }) {
   const status = filterOf("status") || "new";
   const list = usePages("/v1/damage-reports", { status: status === "all" ? null : status, marker_id: filterOf("marker_id") });
-  const filters = html`<${ChoiceFilter} name="status" label=${t("field.status")} otherwise="new" options=${[["new", t("report_status.new")], ["accepted", t("report_status.accepted")], ["rejected", t("report_status.rejected")], ["all", t("filter.all")]]} />`;
+  const filters = html`<${ChoiceFilter} name="status" label=${t("field.status")} otherwise="new" options=${[["new", t("report_status.new")], ["approved", t("report_status.approved")], ["rejected", t("report_status.rejected")], ["all", t("filter.all")]]} />`;
   const empty = html`<${Empty} title=${t("reports.none")}><p>${t("reports.none_text")}</p><p><a href="/operations/reports?status=all">${t("reports.show_all")}</a>${may("PUT /v1/public-page") && html`, <a href="/operations/settings">${t("public_page.title")}</a>`}</p></${Empty}>`;
   return html`<${ListPage} title=${t("reports.title")} base=${BASE} list=${list} columns=${columns()} chosen=${id} filters=${filters} empty=${empty} lead=${t("reports.lead")}
     panel=${id !== null && html`<${One} key=${id} id=${id} onChanged=${list.reload} />`} />`;
@@ -74,7 +74,7 @@ function One({ id, onChanged }) {
           [t("maintenance.decided"), report.decided_by && `${report.decided_by}, ${time(report.decided_at)}`],
           [t("reports.item"), report.item_id && html`<a href=${`/operations/maintenance/${report.item_id}`}>${t("maintenance.one")}</a>`],
         ]} />
-        ${report.status === "new" && may("POST /v1/damage-reports/{report_id}/accept") && html`<${Decision} id=${id} onDone=${changed} />`}
+        ${report.status === "new" && may("POST /v1/damage-reports/{report_id}/approve") && html`<${Decision} id=${id} onDone=${changed} />`}
         ${may("DELETE /v1/damage-reports/{report_id}/photo") && html`<p class="buttons">
           ${report.has_photo && html`<button type="button" class="quiet danger" onClick=${() => setDeleting("photo")}>${t("reports.delete_photo")}</button>`}
           ${report.has_contact && html`<button type="button" class="quiet danger" onClick=${() => setDeleting("contact")}>${t("reports.delete_contact")}</button>`}
@@ -104,17 +104,17 @@ function Contact({ id }) {
 /** @param {{ id: string, onDone: () => void }} props */
 function Decision({ id, onDone }) {
   const form = useForm({ note: "" });
-  const decide = async (/** @type {"accept" | "reject"} */ what) => {
+  const decide = async (/** @type {"approve" | "reject"} */ what) => {
     const note = String(form.values.note).trim();
     const body = what === "reject" ? { reason: note } : note ? { note } : {};
     await request(`/v1/damage-reports/${id}/${what}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-    notify(t(what === "accept" ? "reports.is_accepted" : "reports.is_rejected"));
+    notify(t(what === "approve" ? "reports.is_approved" : "reports.is_rejected"));
     onDone();
   };
   const errors = form.errors.reason ? { note: form.errors.reason, ...form.errors } : form.errors;
   return html`
     <h3>${t("maintenance.decide")}</h3>
-    <${FormFrame} form=${form} onSubmit=${() => decide("accept")} button=${t("reports.accept")}
+    <${FormFrame} form=${form} onSubmit=${() => decide("approve")} button=${t("reports.approve")}
       actions=${html`<button type="button" class="quiet" disabled=${form.busy} onClick=${form.submit(() => decide("reject"))}>${t("reports.reject")}</button>`}>
       <${TextField} form=${{ ...form, errors }} path="note" label=${t("field.note")} hint=${t("reports.note_hint")} />
     </${FormFrame}>

@@ -22,7 +22,7 @@ import { t, textOr } from "../texts/index.js";
 
 const BASE = "/operations/reprocessings";
 const LOOK_MS = 2000;
-const LEVELS = /** @type {const} */ ({ running: "none", ready: "warn", cancelled: "none", failed: "bad", accepted: "good" });
+const LEVELS = /** @type {const} */ ({ running: "none", ready: "warn", cancelled: "none", failed: "bad", approved: "good" });
 const KINDS = ["frame", "archive", "video", "trace", "packets"];
 
 /** @typedef {import("../api/schema.js").components["schemas"]["ReprocessingDocument"]} Reprocessing */
@@ -56,7 +56,7 @@ const State = ({ of }) => html`<${Verdict} level=${LEVELS[of.state]}>${t(`reproc
 function One({ id, onChanged }) {
   const path = { path: { reprocessing_id: id } };
   const found = useLoad((signal) => ok(api.GET("/v1/reprocessings/{reprocessing_id}", { params: path, signal })), [id]);
-  const [accepting, setAccepting] = useState(false);
+  const [approving, setApproving] = useState(false);
   const run = /** @type {Reprocessing | null} */ (found.data);
   const running = run?.state === "running";
   useEffect(() => {
@@ -72,9 +72,9 @@ function One({ id, onChanged }) {
     await ok(api.POST("/v1/reprocessings/{reprocessing_id}/cancel", { params: path }));
     changed();
   });
-  const accept = async () => {
-    await ok(api.POST("/v1/reprocessings/{reprocessing_id}/accept", { params: path }));
-    notify(t("reprocessings.is_accepted"));
+  const approve = async () => {
+    await ok(api.POST("/v1/reprocessings/{reprocessing_id}/approve", { params: path }));
+    notify(t("reprocessings.is_approved"));
     changed();
   };
   return html`
@@ -84,20 +84,20 @@ function One({ id, onChanged }) {
         ${running && html`<progress aria-label=${t("job.progress")} max=${Math.max(run.total, 1)} value=${run.done}></progress>`}
         <p class="buttons">
           ${running && may("POST /v1/reprocessings/{reprocessing_id}/cancel") && html`<button type="button" class="quiet" onClick=${cancel}>${t("action.cancel")}</button>`}
-          ${run.state === "ready" && may("POST /v1/reprocessings/{reprocessing_id}/accept") && html`<button type="button" onClick=${() => setAccepting(true)}>${t("reprocessings.accept")}</button>`}
+          ${run.state === "ready" && may("POST /v1/reprocessings/{reprocessing_id}/approve") && html`<button type="button" onClick=${() => setApproving(true)}>${t("reprocessings.approve")}</button>`}
           <button type="button" class="quiet" onClick=${() => attempt(() => download(run.links.csv, `reprocessing-${id}.csv`))}>${t("maintenance.csv")}</button>
         </p>
         <${Facts} of=${[
           [t("field.created_at"), `${time(run.created_at)}, ${run.who}`],
           ...Object.entries(run.criteria).filter(([, value]) => value !== null).map(([name, value]) => /** @type {[string, any]} */ ([textOr(`reprocessings.by_${name}`, nameOf(name)), valueText(value)])),
           ...["gained", "lost", "changed", "same", "failed"].map((name) => /** @type {[string, any]} */ ([t(/** @type {any} */ (`reprocessings.${name}`)), number(run.summary[/** @type {"same"} */ (name)])])),
-          [t("reprocessings.accepted"), run.accepted_at && `${time(run.accepted_at)}, ${run.accepted_by}`],
+          [t("reprocessings.approved"), run.approved_at && `${time(run.approved_at)}, ${run.approved_by}`],
         ]} />
         <h3>${t("reprocessings.report")}</h3>
         <${Report} key=${`${run.state} ${run.done}`} id=${id} />
       `}</${Shown}>
     </${Panel}>
-    ${accepting && html`<${Confirm} title=${t("reprocessings.accept")} button=${t("reprocessings.accept")} onConfirm=${accept} onClose=${() => setAccepting(false)}><p>${t("reprocessings.accept_text")}</p></${Confirm}>`}
+    ${approving && html`<${Confirm} title=${t("reprocessings.approve")} button=${t("reprocessings.approve")} onConfirm=${approve} onClose=${() => setApproving(false)}><p>${t("reprocessings.approve_text")}</p></${Confirm}>`}
   `;
 }
 

@@ -28,5 +28,5 @@ def add_test_item(connection: sa.Connection, agency_id: str, marker_id: str, fau
     verdict = Verdict(fault, 17.5, 13.1, 4, 5, AT.timestamp() - 3600, (1.2, -0.9))
     upload = ItemUpload(add_test_decode(connection, agency_id), True, "v", AT)
     open_items(connection, agency_id, upload, [Suspicion(marker_id, verdict, 120.0)], None, AT)
-    found = list_items(connection, agency_id, ItemFilter(marker_id=marker_id, what=str(fault), state="open"))
+    found = list_items(connection, agency_id, ItemFilter(marker_id=marker_id, what=str(fault), status="open"))
     return found[0].id

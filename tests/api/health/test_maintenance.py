@@ -127,7 +127,7 @@ def test_approving_changes_the_marker_with_its_history(
     assert len(versions) == (1 if status == "active" else 2)
     if status != "active":
         assert "moved" in versions[-1]["why"]
-    again = owner.post(f"/v1/maintenance/{item_id}/dismiss", json={"note": "no"})
+    again = owner.post(f"/v1/maintenance/{item_id}/reject", json={"reason": "no"})
     assert again.status_code == 409
     actions = [entry["action"] for entry in owner.get("/v1/audit").json()["items"] if entry["subject"] == item_id]
     assert actions == ["maintenance.approved"]
@@ -136,10 +136,10 @@ def test_approving_changes_the_marker_with_its_history(
 def test_dismissing_needs_a_reason_and_stays_in_the_list(server: LiveServer, owner: httpx.Client) -> None:
     marker = _plate(owner, 11.0)
     item_id = _item(server, owner, marker["id"])
-    assert owner.post(f"/v1/maintenance/{item_id}/dismiss", json={}).status_code == 422
-    answer = owner.post(f"/v1/maintenance/{item_id}/dismiss", json={"note": "surveyed again, stands right"})
-    assert answer.json()["status"] == "dismissed"
-    found = owner.get("/v1/maintenance", params={"marker_id": marker["id"], "status": "dismissed"}).json()["items"]
+    assert owner.post(f"/v1/maintenance/{item_id}/reject", json={}).status_code == 422
+    answer = owner.post(f"/v1/maintenance/{item_id}/reject", json={"reason": "surveyed again, stands right"})
+    assert answer.json()["status"] == "rejected"
+    found = owner.get("/v1/maintenance", params={"marker_id": marker["id"], "status": "rejected"}).json()["items"]
     assert found[0]["note"] == "surveyed again, stands right"
     assert owner.get(f"/v1/markers/{marker['id']}").json()["status"] == "active"
     assert _item(server, owner, marker["id"]) != item_id  # new evidence is a new item

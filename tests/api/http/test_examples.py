@@ -51,6 +51,16 @@ def test_every_body_but_files_has_an_example() -> None:
     assert [route for route, _, example in EXAMPLES if example is None] == []
 
 
+@pytest.fixture(scope="module")
+def markers(server: LiveServer) -> None:
+    """Markers of all families, which other examples select."""
+    with server.client(ADMIN_KEY) as client:
+        for route, _, example in EXAMPLES:
+            if route == "POST /v1/markers":
+                assert client.post("/v1/markers", json=example).status_code in (201, 409)
+
+
+@pytest.mark.usefixtures("markers")
 @pytest.mark.parametrize(
     ("route", "kind", "example"),
     [pytest.param(*case, id=f"{case[0]} {number}") for number, case in enumerate(EXAMPLES) if case[0] not in ELSEWHERE],

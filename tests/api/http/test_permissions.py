@@ -82,7 +82,7 @@ BODIES: dict[str, Any] = {
     "PATCH /v1/roads/{road_id}": {"calibration": []},
     "PATCH /v1/plans/{plan_id}": {"name": "q"},
     "POST /v1/maintenance/{item_id}/approve": {"outcome": "none"},
-    "POST /v1/maintenance/{item_id}/dismiss": {"note": "seen"},
+    "POST /v1/maintenance/{item_id}/reject": {"reason": "seen"},
     "POST /v1/damage-reports/{report_id}/reject": {"reason": "seen"},
     "POST /v1/roads/{road_id}/locate": {"positions": [[33.501, 43.5]]},
     "POST /v1/roads/{road_id}/position": {"references": [{"measure_m": 10}]},

@@ -154,7 +154,7 @@ def test_every_family_and_status_has_a_symbol(client: httpx.Client, name: str) -
             places = anonymous.get(f"{style['sprite']}{suffix}.json").json()
             assert anonymous.get(f"{style['sprite']}{suffix}.png").headers["content-type"] == "image/png"
             assert {layer["layout"]["icon-image"] for layer in symbols} <= set(places)
-    statuses = {"plans": get_args(PlanStatus), "maintenance": ("open", "approved", "dismissed")}.get(name, STATUSES)
+    statuses = {"plans": get_args(PlanStatus), "maintenance": ("open", "approved", "rejected")}.get(name, STATUSES)
     shown = {(str(layer["filter"][1]), layer["filter"][2][2]) for layer in symbols}
     for family in FAMILY_NAMES:
         assert family in SHAPES

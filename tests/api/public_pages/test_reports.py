@@ -224,32 +224,32 @@ def test_texts_are_kept_as_texts_without_what_is_none(
 # --- decisions ----------------------------------------------------------------------------------------------------
 
 
-def test_an_accepted_report_becomes_an_item_of_the_work_list(
+def test_an_approved_report_becomes_an_item_of_the_work_list(
     server: LiveServer, owner: httpx.Client, anybody: httpx.Client, marker: dict[str, Any]
 ) -> None:
     for kind in ("dirty", "loose"):
         assert send_report(anybody, server, marker["id"], kind=kind).status_code == 303
     loose, dirty = reports_of(owner, marker)
-    assert reports_of(owner, marker, status="accepted") == []
+    assert reports_of(owner, marker, status="approved") == []
     with server.agency("maintainers of roads", Scope.VIEWER) as viewer:
         assert reports_of(viewer, marker) == [loose, dirty]
-        refused(viewer.post(f"/v1/damage-reports/{dirty['id']}/accept", json={}), 403)
-    decided = owner.post(f"/v1/damage-reports/{dirty['id']}/accept", json={"note": "clean it"}).json()
+        refused(viewer.post(f"/v1/damage-reports/{dirty['id']}/approve", json={}), 403)
+    decided = owner.post(f"/v1/damage-reports/{dirty['id']}/approve", json={"note": "clean it"}).json()
     assert (decided["status"], decided["note"], decided["decided_by"]) == (
-        "accepted", "clean it", "maintainers of roads admin",
+        "approved", "clean it", "maintainers of roads admin",
     )  # fmt: skip
     item = owner.get(f"/v1/maintenance/{decided['item_id']}").json()
     assert (item["what"], item["status"], item["marker_id"], item["road"]) == ("reported", "open", marker["id"], "A 5")
     reported = {"report_id": dirty["id"], "kind": "dirty", "at": dirty["created_at"]}
     assert item["evidence"] == {"uploads": [], "reports": [reported]}
     # a second report adds to the open item, which becomes more urgent
-    again = owner.post(f"/v1/damage-reports/{loose['id']}/accept", json={}).json()
+    again = owner.post(f"/v1/damage-reports/{loose['id']}/approve", json={}).json()
     assert again["item_id"] == decided["item_id"]
     more = owner.get(f"/v1/maintenance/{decided['item_id']}").json()
     assert [report["kind"] for report in more["evidence"]["reports"]] == ["dirty", "loose"]
     assert more["priority"] > item["priority"]
     assert owner.get(f"/v1/markers/{marker['id']}").json()["status"] == "active"
-    refused(owner.post(f"/v1/damage-reports/{dirty['id']}/accept", json={}), 409, "conflict")
+    refused(owner.post(f"/v1/damage-reports/{dirty['id']}/approve", json={}), 409, "conflict")
     refused(owner.post(f"/v1/damage-reports/{dirty['id']}/reject", json={"reason": "x"}), 409, "conflict")
     approved = owner.post(f"/v1/maintenance/{item['id']}/approve", json={"outcome": "suspect"})
     assert approved.status_code == 200, approved.text
@@ -257,7 +257,7 @@ def test_an_accepted_report_becomes_an_item_of_the_work_list(
     assert "in use, to be checked" in anybody.get(f"/m/{marker['id']}", headers=HTML).text
     actions = [entry["action"] for entry in owner.get("/v1/audit", params={"limit": 1000}).json()["items"]]
     assert actions[-4:] == [
-        "damage-report.accepted", "damage-report.accepted", "marker.changed", "maintenance.approved",
+        "damage-report.approved", "damage-report.approved", "marker.changed", "maintenance.approved",
     ]  # fmt: skip
     agency_id = server.app.state.use_cases.public_pages.read(marker["id"]).agency_id
     with server.app.state.database.read() as connection:

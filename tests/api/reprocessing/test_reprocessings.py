@@ -84,7 +84,7 @@ def ended(client: httpx.Client, answer: httpx.Response) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_what_changed_is_reported_and_becomes_current_when_accepted(
+def test_what_changed_is_reported_and_becomes_current_when_approved(
     server: LiveServer, admin: httpx.Client, place: Callable[[], dict[str, Any]]
 ) -> None:
     gained, lost, changed, same = (upload(admin, place()) for _ in range(4))
@@ -112,20 +112,20 @@ def test_what_changed_is_reported_and_becomes_current_when_accepted(
     # nothing has changed yet
     assert admin.get(f"/v1/decodes/{changed['id']}").json()["readings"] == old["readings"]
     assert admin.get(f"/v1/decodes/{changed['id']}/versions").json() == {"items": []}
-    accepted = admin.post(f"{run['links']['self']}/accept")
-    assert accepted.json()["state"] == "accepted", accepted.text
+    approved = admin.post(f"{run['links']['self']}/approve")
+    assert approved.json()["state"] == "approved", approved.text
     now = admin.get(f"/v1/decodes/{changed['id']}").json()
     assert (now["readings"][0]["digits"], now["decoder"]) == (digits, changed["decoder"])
     (version,) = admin.get(f"/v1/decodes/{changed['id']}/versions").json()["items"]
     assert (version["decoder"], version["result"]) == (OLD, old)
     with across_agencies(), server.app.state.database.read() as connection:
         assert connection.execute(sa.select(sa.func.count()).select_from(observations)).scalar_one() == seen
-    refused(admin.post(f"{run['links']['self']}/accept"), 409, "conflict")
+    refused(admin.post(f"{run['links']['self']}/approve"), 409, "conflict")
     again = admin.post("/v1/reprocessings", json={"older_than": "0.2"})
     refused(again, 422, "invalid-parameter")  # none is older any more
     with server.agency("strangers", Scope.ADMIN) as stranger:
         refused(stranger.get(run["links"]["csv"]), 404, "not-found")
-        refused(stranger.post(f"{run['links']['self']}/accept"), 404, "not-found")
+        refused(stranger.post(f"{run['links']['self']}/approve"), 404, "not-found")
 
 
 def test_criteria_choose_the_uploads(
@@ -185,7 +185,7 @@ def test_a_shard_goes_on_where_it_was_killed_and_can_be_cancelled(
     state.use_cases.jobs.run_job(jobs[0])
     assert asked == [uploads[0]["id"], uploads[1]["id"], uploads[1]["id"]]
     assert admin.get(f"/v1/jobs/{jobs[0]}").json()["links"]["result"] == run["links"]["self"]
-    refused(admin.post(f"{run['links']['self']}/accept"), 409, "conflict")
+    refused(admin.post(f"{run['links']['self']}/approve"), 409, "conflict")
     state.use_cases.jobs.run_job(jobs[1])
     run = admin.get(run["links"]["self"]).json()
     assert (run["state"], run["summary"]["failed"], run["summary"]["same"]) == ("ready", 1, 2)
@@ -193,7 +193,7 @@ def test_a_shard_goes_on_where_it_was_killed_and_can_be_cancelled(
     assert (failed["decode_id"], failed["error"]["detail"]) == (uploads[2]["id"], "it is not what it was")
     other = admin.post("/v1/reprocessings", json={}).json()
     assert admin.post(f"{other['links']['self']}/cancel").json()["state"] == "cancelled"
-    refused(admin.post(f"{other['links']['self']}/accept"), 409, "conflict")
+    refused(admin.post(f"{other['links']['self']}/approve"), 409, "conflict")
 
 
 @pytest.mark.slow

@@ -69,6 +69,14 @@ def test_a_plan_comes_back_as_it_was() -> None:
     assert write_plan(again) == write_plan(plan)
 
 
+def test_a_plan_of_an_earlier_release_is_read() -> None:
+    plan = full_plan()
+    written = write_plan(plan)
+    older = written.replace(b"_m_s2\"", b"_mps2\"").replace(b"speed_m_s\"", b"speed_mps\"")
+    assert older != written
+    assert write_plan(read_plan(older)) == written
+
+
 def test_the_document_is_plain_json_with_a_summary() -> None:
     document = orjson.loads(write_plan(full_plan()))
     assert document["format"] == "waymark-plan/1"
