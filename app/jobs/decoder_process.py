@@ -19,10 +19,10 @@ from enum import Enum
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from app.errors import ProcessStopped, WaymarkError
 from app.markers.plate import PlateCode
@@ -271,7 +271,7 @@ def process_id() -> int:
     return os.getpid()
 
 
-def warm_frame() -> np.ndarray[Any, np.dtype[np.uint8]]:
+def warm_frame() -> npt.NDArray[np.uint8]:
     """A plate seen from straight above, so that every stage of the decoder runs once."""
     pitch, gap, unit = 10, 1, 9
     code = PlateCode.from_position(114.179583, 22.305278)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -77,20 +76,20 @@ def _shade_field(shadow: Shadow) -> FloatArray:
 
 @kernel
 def accumulate_face(
-    rays: Any,
-    samples: Any,
-    row_time_s: Any,
-    motion: object,
-    spin: object,
+    rays: Matrix,
+    samples: Matrix,
+    row_time_s: Matrix,
+    motion: Matrix,
+    spin: Matrix,
     height_m: float,
-    face_from_ground: Any,
-    reflectance: Any,
-    emission: Any,
-    light: Any,
-    shade: object,
-    shade_from_ground: object,
-    out: Any,
-    cover: Any,
+    face_from_ground: Matrix,
+    reflectance: FloatArray,
+    emission: FloatArray,
+    light: FloatArray,
+    shade: FloatArray,
+    shade_from_ground: Matrix,
+    out: FloatArray,
+    cover: FloatArray,
 ) -> None:  # pragma: no cover - compiled
     """Integrate what each pixel sees of a square on the road over its area and the exposure.
 
@@ -153,7 +152,7 @@ def accumulate_face(
 
 @step
 def _ground(
-    ray: Any, du: float, dv: float, t: float, motion: Any, spin: Any, height_m: float
+    ray: Matrix, du: float, dv: float, t: float, motion: Matrix, spin: Matrix, height_m: float
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """Where a spot of a pixel looks at the road at time t; far away above the horizon."""
     dx = ray[0, 0] + du * ray[1, 0] + dv * ray[2, 0]
@@ -168,14 +167,14 @@ def _ground(
 
 @kernel
 def _misses(
-    ray: object,
+    ray: Matrix,
     row_time_s: float,
     begin: float,
     end: float,
-    motion: object,
-    spin: object,
+    motion: Matrix,
+    spin: Matrix,
     height_m: float,
-    face_from_ground: Any,
+    face_from_ground: Matrix,
     size: int,
 ) -> bool:  # pragma: no cover - compiled
     """Whether the corners of a pixel's footprint at both ends of the exposure all lie beyond one side of the face."""
@@ -193,7 +192,9 @@ def _misses(
 
 
 @kernel
-def _bilinear(field: Any, field_from_ground: Any, gx: float, gy: float) -> float:  # pragma: no cover - compiled
+def _bilinear(
+    field: FloatArray, field_from_ground: Matrix, gx: float, gy: float
+) -> float:  # pragma: no cover - compiled
     size = field.shape[0]
     if size == 1:
         return float(field[0, 0])
@@ -209,7 +210,7 @@ def _bilinear(field: Any, field_from_ground: Any, gx: float, gy: float) -> float
 
 @kernel
 def shade_rays(
-    rays: Any, height_m: float, shade: object, shade_from_ground: object, out: Any
+    rays: Matrix, height_m: float, shade: FloatArray, shade_from_ground: Matrix, out: FloatArray
 ) -> None:  # pragma: no cover - compiled
     """Share of the light that arrives where each ray meets the road; 1 above the horizon. ``out``: float32 (H, W)."""
     for i in range(out.shape[0]):
@@ -224,7 +225,13 @@ def shade_rays(
 
 @kernel
 def expose_photo(
-    photo: Any, share: Any, encode: Any, sigma: Any, noise: Any, offsets: Any, out: Any
+    photo: npt.NDArray[np.uint8],
+    share: FloatArray,
+    encode: FloatArray,
+    sigma: FloatArray,
+    noise: FloatArray,
+    offsets: npt.NDArray[np.int64],
+    out: npt.NDArray[np.uint8],
 ) -> None:  # pragma: no cover - compiled
     """Give a photo the camera's tone and noise.
 

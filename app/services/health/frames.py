@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 
 from app.families.family import Match, Nearby
@@ -227,7 +227,7 @@ def _expected(row: MarkerRow, view: VehicleView) -> float:
     return float(_frame_rate(unit_px).min())
 
 
-def _frame_rate(unit_px: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _frame_rate(unit_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Read rate of a frame by day, by the height of a unit: `app.planning.predict.rates.PlateModel`."""
     model = fitted_models().plate_model(DAY)
     nodes, weights = normal_quadrature()

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from datetime import datetime
 from itertools import combinations, pairwise
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 import sqlalchemy as sa
 
@@ -454,5 +454,5 @@ def _passed_probability(first: TagFix, second: TagFix, gap_m: float, tag: Regist
     return inside * rate
 
 
-def _direction(heading_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _direction(heading_deg: float) -> npt.NDArray[np.float64]:
     return np.array([math.sin(math.radians(heading_deg)), math.cos(math.radians(heading_deg))])
