@@ -72,7 +72,7 @@ def draw_lane(pixels: npt.NDArray[np.uint8], overlay: LaneOverlay) -> npt.NDArra
         filled = canvas.copy()
         for polygon in overlay.area_px:
             cv2.fillPoly(filled, [_fixed(polygon)], _LANE_BGR, cv2.LINE_AA, 4)
-        canvas = cv2.addWeighted(filled, _LANE_SHARE, canvas, 1 - _LANE_SHARE, 0)
+        cv2.addWeighted(filled, _LANE_SHARE, canvas, 1 - _LANE_SHARE, 0, dst=canvas)
     for name, thick in (("centre", 2), ("left", 4), ("right", 4)):
         pieces = [_fixed(piece) for piece in getattr(overlay, name).pieces_px]
         cv2.polylines(canvas, pieces, False, _DARK_BGR, max(4, round((thick + 3) * scale)), cv2.LINE_AA, 4)
@@ -80,7 +80,7 @@ def draw_lane(pixels: npt.NDArray[np.uint8], overlay: LaneOverlay) -> npt.NDArra
     for u, v in _fixed(overlay.markers.points_px[overlay.markers.visible]).reshape(-1, 2).tolist():
         cv2.circle(canvas, (u, v), round(8 * scale) * 16, _DARK_BGR, cv2.FILLED, cv2.LINE_AA, 4)
         cv2.circle(canvas, (u, v), round(5 * scale) * 16, _MARKER_BGR, cv2.FILLED, cv2.LINE_AA, 4)
-    return np.asarray(canvas, dtype=np.uint8)
+    return canvas
 
 
 def _fixed(points_px: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
