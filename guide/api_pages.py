@@ -111,8 +111,8 @@ def _first_page(document: dict[str, Any], tags: dict[str, str], operations: dict
         f"# HTTP API\n\n{document['info']['description']}\n"
         f"Version {document['info']['version']}. These pages are made from the document that the server sends at "
         "`/openapi.json`; a running server also shows it at `/docs`, where requests can be tried out. "
-        "[A client can be generated from it](../../generated-client.md). The [scope](../../access.md) of a key determines "
-        "which operations it may call.\n\n"
+        "[A client can be generated from it](../../generated-client.md). The [scope](../../access.md) of a key "
+        "determines which operations it may call.\n\n"
         + table(("part", "content", "operations"), rows)
         + f"[Schemas that several parts share]({_SHARED}.md). "
         + f"[The document of the OGC API]({_OGC_DOCUMENT}.md), which GIS clients read.\n\n"
