@@ -111,8 +111,8 @@ def _first_page(document: dict[str, Any], tags: dict[str, str], operations: dict
         f"# HTTP API\n\n{document['info']['description']}\n"
         f"Version {document['info']['version']}. These pages are made from the document that the server sends at "
         "`/openapi.json`; a running server also shows it at `/docs`, where requests can be tried out. "
-        "[A client can be generated from it](../../generated-client.md), "
-        "[scopes](../../access.md) determine which key may call what.\n\n"
+        "[A client can be generated from it](../../generated-client.md). The [scope](../../access.md) of a key "
+        "determines which operations it may call.\n\n"
         + table(("part", "content", "operations"), rows)
         + f"[Schemas that several parts share]({_SHARED}.md). "
         + f"[The document of the OGC API]({_OGC_DOCUMENT}.md), which GIS clients read.\n\n"
@@ -134,7 +134,7 @@ def _tag_page(
 def _shared_page(pages: dict[str, str], document: dict[str, Any]) -> str:
     link, schemas = _link_from(_SHARED, pages), document["components"]["schemas"]
     names = sorted(name for name, page in pages.items() if page == _SHARED)
-    return "# Shared schemas\n\nSchemas that several parts of the API use.\n\n## Schemas\n\n" + "".join(
+    return "# Shared schemas\n\nThese schemas are used by several parts of the API.\n\n## Schemas\n\n" + "".join(
         schema_section(name, schemas[name], link) for name in names
     )
 
@@ -144,9 +144,9 @@ def _ogc_page() -> str:
     parameters = document["components"]["parameters"]
     text = (
         "# The document of the OGC API\n\n"
-        "`GET /ogc/api` describes the same API for GIS clients in OpenAPI 3.0, with a literal path for each collection "
-        "and parameters that are named like its fields. [OGC API](../../ogc.md) explains how to use it; "
-        "[ogc](ogc.md) has the requests with their schemas.\n\n## Paths\n\n"
+        "`GET /ogc/api` describes the same API for GIS clients in OpenAPI 3.0: each collection has a path of its own, "
+        "and a parameter for each of its fields. [OGC API](../../ogc.md) explains how to use it; "
+        "[ogc](ogc.md) lists the requests with their schemas.\n\n## Paths\n\n"
     )
     rows = []
     for operation in _list_operations(document):
@@ -172,7 +172,7 @@ def _problems_page() -> str:
     ]
     return (
         "# Problems\n\nThe response to an error is a problem document of RFC 9457, `application/problem+json`. "
-        "`detail` states what is wrong; `field`, `limit` and `cure` give the input, the allowed values, and the cure; "
+        "`detail` states what is wrong; `field` names the input, `limit` gives the allowed values, `cure` the remedy; "
         "`errors` lists all faults of the request. The members are those of [`Problem`](api/schemas.md#problem).\n\n"
         + table(("status", "type", "title"), rows)
     )

@@ -21,9 +21,9 @@ def write_command_page(folder: Path) -> tuple[str, str, str]:
     path.parent.mkdir(parents=True, exist_ok=True)
     parts = [
         "# The command `waymark`\n\n"
-        "Made from the program's own help: `waymark COMMAND --help` prints the same. Settings are environment "
-        "variables ([settings](../settings.md)). An expected error is one line on the standard error, with limit and "
-        "cure, and exit status 1; invalid arguments are exit status 2.\n\n"
+        "This page is made from the program's own help: `waymark COMMAND --help` prints the same text. Settings are "
+        "environment variables ([settings](../settings.md)). For an expected error, a command prints the error, its "
+        "limit and its cure to standard error, and ends with exit status 1; for invalid arguments, with 2.\n\n"
     ]
     parts += (_section(name, command) for name, command in list_commands())
     path.write_text("".join(parts))
