@@ -82,10 +82,10 @@ def run_forged(seed: int, short: bool) -> Result:
     row("recorded 5 km away, of markers never heard", _from_afar(lane, days[2], keys, counts[3], rng), True)
     head = ("packets", "attacks", "accepted", "goal", "met", "real ones accepted", "verdicts on attacks")
     note = (
-        "The stored sequences are written to text and read back between the second and the third day. In the last row "
-        "but one, an attacker's receiver recorded on the second day what the vehicle did not receive; the replayed "
-        "packets have the content that their markers send anyway. In the last row a packet counts as accepted if its "
-        "marker is used after merging with the vehicle's track; no position is registered."
+        "The stored sequences are written to text and read back between the second and the third day. In the "
+        "second-to-last row, an attacker's receiver recorded on the second day what the vehicle did not receive; the "
+        "replayed packets have the content that their markers send anyway. In the last row, no position is registered, "
+        "and a packet counts as accepted if its marker is used after merging with the vehicle's track."
     )
     return note, head, rows
 
@@ -215,9 +215,9 @@ def run_tracking(seed: int, short: bool) -> Result:
     )  # fmt: skip
     return (
         "Distance of the front axle from the true centre line; poses with RTK noise; at most 25 mph in bends. The "
-        "paper's 0.42 and 0.38 m (table 1) are not comparable: they are labelled mean squared errors, in metres; 0.42 "
-        "is the magnitude of the components 0.25 and 0.34 of route 2, but 0.38 of route 3 is its Y component alone "
-        "(0.24 and 0.38), and neither is a distance across the path.",
+        "paper's 0.42 and 0.38 m (table 1) are not comparable, because neither is a distance across the path. They "
+        "are labelled mean squared errors but given in metres: 0.42 is the magnitude of route 2's components 0.25 and "
+        "0.34, while 0.38 is only the Y component of route 3 (0.24 and 0.38).",
         head,
         rows,
     )
@@ -252,7 +252,11 @@ def run_radio(seed: int, short: bool) -> Result:
         aloha = float(np.exp(-2 * count * hard.airtime_s / interval_s))
         name = f"heard of {count} markers, {interval_s:g} s, {bandwidth_hz // 1000} kHz; with capture {rates[1]:.2f}"
         rows.append((name, f"{rates[0]:.3f}", f"{aloha:.3f}", met(abs(rates[0] - aloha) <= 0.04)))
-    return "SF7, 27 bytes; strengths 8 dB apart.", ("simulation", "found", "paper, ALOHA", "met"), rows
+    note = (
+        "Spreading factor 7, packets of 27 bytes, signal strengths with a standard deviation of 8 dB. The column "
+        '"found" is the result of the simulation.'
+    )
+    return note, ("simulation", "found", "paper, ALOHA", "met"), rows
 
 
 # --- speed --------------------------------------------------------------------------------------------------------

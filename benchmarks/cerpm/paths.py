@@ -90,10 +90,12 @@ def run_path(seed: int, short: bool) -> Result:
     got = curvature.curvature_rms_per_m
     confidence, right = (100 * share for share in all_rows.confidence_and_share_right)
     note = (
-        "RMS distance from the true centre line to the path [m], by lane; maximum and coverage over all lanes. Met: "
-        "RMS on each route, and on the generated lanes together. Own track: the vehicle's positions used as path.\n\n"
+        "RMS distance from the true centre line to the path [m], by lane; maximum and coverage over all lanes. The "
+        'goal is met if the RMS on each route, and on the generated lanes together, meets it. "Own track" uses the '
+        "vehicle's positions as the path.\n\n"
         f"Curvature at 40 ft: {got:.4f} 1/m RMS, goal {CURVATURE_GOAL_PER_M}, met: {met(got <= CURVATURE_GOAL_PER_M)}. "
-        f"Over all rows the mean confidence (within 0.25 m of the centre) is {confidence:.1f} %; {right:.1f} % are."
+        "Over all rows, the mean confidence that a station is within 0.25 m of the centre is "
+        f"{confidence:.1f} %; {right:.1f} % are."
     )
     head = (
         "markers", "Karlsruhe low", "Karlsruhe moderate", "TFHRC bend", "TFHRC low", "made", "all", "max [m]",
@@ -199,7 +201,8 @@ def run_spoof(seed: int, short: bool) -> Result:
         )  # fmt: skip
     head = ("markers", "named", "others left out", "RMS [m]", "max [m]", "goal", "met", "paper's way")
     return (
-        "One marker of each run sends a position 30 m off, in any direction that is on no line of the lane.",
+        "In each run, one marker sends a position that is 30 m off, in a random direction that does not put it on a "
+        "boundary of the lane.",
         head,
         rows,
     )
@@ -235,8 +238,9 @@ def run_dirty(seed: int, short: bool) -> Result:
         )  # fmt: skip
     head = ("log", "runs", "exceptions", "RMS [m]", "max [m]", "coverage", "goal", "met", "own track")
     note = (
-        "Packet logs at 40 ft through link, verifier and merger, no place registered: a tenth of the packets corrupt, "
-        "a third twice, out of order, the clock up to 10 s off."
+        "Packet logs with markers every 40 ft pass the radio link, verification and merging; no position is "
+        "registered. A tenth of the packets are corrupt, a third are duplicated, the order is mixed, and the clock is "
+        "up to 10 s off."
     )
     return note, head, rows
 

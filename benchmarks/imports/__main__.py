@@ -44,7 +44,10 @@ def _print_faults(judge: Judge, seed: int, count: int) -> bool:
         if not math.isnan(judged.moved_m) and judged.moved_m > _MUST_M:
             far[judged.verdict] += 1
     total: Counter[str] = sum(found.values(), Counter())
-    print(f"### imports-faults\n\n{count} planted faults, seed {seed}.\n")
+    print(
+        f"### imports-faults\n\n{count} planted faults, seed {seed}. A standing caution is a warning that clean "
+        "surveys get too.\n"
+    )
     print(f"| fault | planted | {' | '.join(VERDICTS)} |\n|---|---|{'---|' * len(VERDICTS)}")
     for kind, verdicts in found.items():
         print(f"| {kind} | {verdicts.total()} | {' | '.join(str(verdicts[v]) for v in VERDICTS)} |")
@@ -53,8 +56,8 @@ def _print_faults(judge: Judge, seed: int, count: int) -> bool:
     detected = 1 - total["missed"] / count
     named = (total["refused"] + total["warned"]) / count
     print(
-        f"\nIdentified by a check of its own, refused or warned: {named:.1%}. With those that got only a standing "
-        f"caution, which clean surveys get too (next table): {detected:.1%} (goal {GOAL:.0%}).\n"
+        f"\n{named:.1%} were refused or warned about by a check for that fault; together with those that got only a "
+        f"standing caution, {detected:.1%} (goal {GOAL:.0%}).\n"
     )
     return detected >= GOAL and not far["missed"]
 

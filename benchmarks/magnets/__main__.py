@@ -103,7 +103,8 @@ def run_recall(seed: int, short: bool) -> Result:
             )
         )  # fmt: skip
     head = ("clearance", "magnets", "recall 0°", "recall 90°", "wrong", "precision", "goal", "met", "metro", "paper")
-    return f"Drives at {', '.join(map(str, speeds))} mph. metro and paper: recall of magnets at 0° / 90°.", head, rows
+    note = f"Drives at {', '.join(map(str, speeds[:-1]))} and {speeds[-1]} mph."
+    return f'{note} The columns "metro" and "paper" give the recall of magnets at 0° / 90°.', head, rows
 
 
 def run_lateral(seed: int, short: bool) -> Result:
@@ -117,7 +118,11 @@ def run_lateral(seed: int, short: bool) -> Result:
             tally.add(score_magnets(drive, decode_trace(drive.trace, BAR)))
         rms = float(np.sqrt(np.mean(np.square(tally.lateral_cm))))
         rows.append((f"{clearance_cm} cm", len(tally.lateral_cm), f"{rms:.2f}", goal, _met(rms <= goal)))
-    return "Root mean square, 20 to 60 mph.", ("clearance", "magnets", "RMS [cm]", "goal", "met"), rows
+    return (
+        "Root mean square error of the lateral position, 20 to 60 mph.",
+        ("clearance", "magnets", "RMS [cm]", "goal", "met"),
+        rows,
+    )
 
 
 def run_tags(seed: int, short: bool) -> Result:
@@ -147,8 +152,8 @@ def run_tags(seed: int, short: bool) -> Result:
     peer = score_tags(drive, _metro(drive), segment_m=0.1)
     rows.append(_tag_row(f"drive of {drive.trace.t_s[-1] / 60:.0f} min, Seg_d 0.1 m", ours, 0.98, peer, "-"))
     return (
-        "The decoder knows the format of the tags, but not their codes. Of tags at 30 cm the paper states the accuracy "
-        "of their polarities only, more than 97 % (section 7.3). Its 1.0 is from a rough road.",
+        "The decoder knows the format of the tags, but not their codes. For tags at 30 cm the paper states only the "
+        "accuracy of the polarities, more than 97 % (section 7.3). Its 1.0 was measured on a rough road.",
         ("tags", "n", "right", "wrong", "goal", "met", "metro", "paper"),
         rows,
     )
@@ -198,7 +203,7 @@ def run_ratio(seed: int, short: bool) -> Result:
             )
         )
     head = ("drive", "n", "mean", "std", "goal std", "met", "metro", "paper")
-    return "Measured over true distance ratio; the mean must be within 0.003 of 1.", head, rows
+    return "Deviation ratio: measured over true distance ratio. Its mean must be within 0.003 of 1.", head, rows
 
 
 def run_wheel(seed: int, short: bool) -> Result:
@@ -222,9 +227,10 @@ def run_wheel(seed: int, short: bool) -> Result:
         )  # fmt: skip
     head = ("wheels", "magnets", "accuracy", "precision", "recall", "goal", "met", "metro", "without AMN", "paper")
     return (
-        "Upright magnets in front of the left wheel, 30 mph. Accuracy: correct readings over the sum of actual, wrong "
-        "and false ones. metro searches the z axis, as in the paper, but the strongest of twelve sensors counts, where "
-        "the paper used the one in front of the wheel: without AMN the two are not comparable.",
+        "Upright magnets in front of the left wheel, 30 mph. Accuracy is correct readings over the sum of actual, "
+        'wrong and false ones. The column "metro" searches the z axis, as the paper does, but takes the strongest of '
+        "twelve sensors, where the paper used the one in front of the wheel. Therefore the two are not comparable "
+        "without AMN, the paper's cancellation of wheel noise.",
         head,
         rows,
     )
@@ -249,7 +255,8 @@ def run_lines(seed: int, short: bool) -> Result:
                 )
             )  # fmt: skip
     head = ("distance, clearance", "magnets", "read", "worst drive", "wrong", "false")
-    return "Lines anywhere under the bar, belt dipoles of 0.1 to 1 A m2, 8 to 25 m/s.", head, rows
+    note = "Lines of magnets anywhere under the bar, one magnet about every turn of the wheel; "
+    return f"{note}belt dipoles of 0.1 to 1 A m2, 8 to 25 m/s.", head, rows
 
 
 def run_false(seed: int, short: bool) -> Result:
@@ -273,7 +280,7 @@ def run_false(seed: int, short: bool) -> Result:
         rate = found / km
         rows.append((name, f"{km:.1f}", found, f"{rate:.2f}", goal, _met(rate <= goal), f"{metro / km:.0f}", "0"))
     head = ("road", "km", "false", "per km", "goal", "met", "metro", "paper")
-    return "Readings where there is no magnet (false positives).", head, rows
+    return "False positives: readings where there is no magnet.", head, rows
 
 
 def run_speed(seed: int, short: bool) -> Result:

@@ -70,10 +70,10 @@ def run_physics(seed: int, short: bool) -> tuple[str, Sequence[str], list[Sequen
     rows = [_row(physics, seed, _drives(short)) for physics in ROWS]
     head = ("simulation", "recall", "worst drive", "wrong", "false", "precision", "tags right", "wrong tags")
     note = (
-        "Single magnets, tags (M 3, L 4 m, Seg_d 1 m) and the ferrous set one after the other on each drive, 20 to 60 "
-        "mph; the decoder is the usual one. Each cell: at a clearance of "
+        "Each drive has single magnets, tags (M 3, L 4 m, Seg_d 1 m) and the ferrous set one after the other, at 20 to "
+        "60 mph; the decoder is unchanged. Each cell has the value for a clearance of "
         + " / ".join(f"{cm} cm" for cm in CLEARANCES_CM)
-        + f". Tags: of {len(CLEARANCES_CM)} x {_drives(short) * TAGS}. Recall counts single magnets and those of tags."
+        + f". There are {_drives(short) * TAGS} tags at each clearance. Recall counts single magnets and those of tags."
     )
     return note, head, rows
 

@@ -44,7 +44,8 @@ def measure_commit(short: bool) -> Section:
         rows.append((kind, markers, f"{made_s:.1f}", f"{seconds:.1f}", f"{markers / seconds:.0f}"))
     head = ("database", "markers", "place, check and store the plan [s]", "commit [s]", "markers/s")
     text = (
-        "A plan of plates is made, approved by another key and committed through the service, in one process.\n\n"
+        "A plan of plates is made, approved by the holder of another key, and committed through the service, in one "
+        "process.\n\n"
         f"{table(head, rows)}\n\nGoal: {GOAL_MARKERS} markers within {GOAL_S:g} s on each database."
     )
     return Section("planning-commit", text, met)

@@ -70,10 +70,11 @@ def measure_optimiser(short: bool) -> Section:
         values = [f"{found[n].of_even:.2f} ({found[n].of_bound:.2f})" if n in found else "-" for n in names]
         cells.append((requirement, *values))
     text = (
-        "Cost of markers of the optimised plan as a share of even spacing of equal quality, in brackets over the bound "
-        "below which no plan with the same pairs can be; example prices.\n\n"
-        f"{table(('requirement', *names), cells)}\n\nGoals: at most {GOAL:g} on generated roads with bends: {met} of "
-        f"{len(bends)}; equal to brute force on short lines: {exact} of {lines}."
+        "Cost of the markers of the optimised plan as a share of the cost of even spacing with equal quality. In "
+        "brackets: the cost over the lower bound for any plan with the same pairs of markers; 1.00 is optimal. Example "
+        "prices.\n\n"
+        f"{table(('requirement', *names), cells)}\n\nGoals: a cost share of at most {GOAL:g} on generated roads "
+        f"with bends: {met} of {len(bends)}; equal to brute force on short lines: {exact} of {lines}."
     )
     return Section("planning-optimiser", text, met == len(bends) and exact == lines)
 

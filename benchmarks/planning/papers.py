@@ -52,7 +52,7 @@ def measure_papers(short: bool) -> Section:
     del short
     rows = [*plate_rows(), *capacity_rows(), *cost_rows(), *cerpm_rows()]
     cells = [(row.what, row.paper, row.waymark, "yes" if row.same else "NO") for row in rows]
-    text = "Set-ups of the papers, planned and computed by Waymark.\n\n"
+    text = "Figures that the papers state for their set-ups, and what Waymark computes for the same ones.\n\n"
     text += table(("set-up", "paper", "Waymark", "same"), cells)
     return Section("planning-papers", text, all(row.same for row in rows))
 

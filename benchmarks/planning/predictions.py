@@ -96,10 +96,10 @@ def measure_predictions(short: bool) -> Section:
         "Predictions of the checks beside simulated drives of the proof, on two generated roads to which nothing was "
         "fitted, and on four real lanes that helped to choose the form of the models, but not their parameters. Read "
         "rates as shares of passes; path errors as root mean squares [m].\n\n"
-        f"{table(head, cells)}\n\nGoals: all within {GOAL:.0%}: {sum(abs(r.difference) <= GOAL for r in rows)} of "
-        f"{len(rows)}; none better than measured by more than that: {sum(r.optimism <= GOAL for r in rows)} of "
-        f"{len(rows)}. Worst: {worst.what} on {worst.road}, {worst.difference:+.1%}; most optimistic: {hopeful.what} "
-        f"on {hopeful.road}, {hopeful.optimism:+.1%}."
+        f"{table(head, cells)}\n\nGoals: all predictions within {GOAL:.0%} of the measurement: "
+        f"{sum(abs(r.difference) <= GOAL for r in rows)} of {len(rows)}; none more than {GOAL:.0%} too optimistic: "
+        f"{sum(r.optimism <= GOAL for r in rows)} of {len(rows)}. Worst: {worst.what} on {worst.road}, "
+        f"{worst.difference:+.1%}; most optimistic: {hopeful.what} on {hopeful.road}, {hopeful.optimism:+.1%}."
     )
     return Section("planning-predictions", text, abs(worst.difference) <= GOAL)
 

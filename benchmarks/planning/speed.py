@@ -68,13 +68,17 @@ def measure_speed(short: bool) -> Section:
     ]  # fmt: skip
     last, before = found[-1], found[-2]
     growth = last.total_s / last.km / (before.total_s / before.km)
-    counts = ", ".join(f"{count} {family}" for family, count in last.markers.items())
+    names = {"cerpm": "CERPMs", "magnet": "magnets", "plate": "plates"}
+    counts = ", ".join(f"{count} {names.get(family, family)}" for family, count in last.markers.items())
     limit_s = GOAL_S * max(last.km / GOAL_KM, 0.2)
-    goals = f"Goals: {GOAL_S:g} s for {GOAL_KM:g} km; seconds a kilometre grow by at most {GROWTH:g}"
+    goals = (
+        f"Goals: {GOAL_S:g} s for {GOAL_KM:g} km; from the second longest road to the longest, the seconds per "
+        f"kilometre grow by a factor of at most {GROWTH:g} (measured: {growth:.2f})."
+    )
     text = (
-        f"Two-lane road with plates, line magnets, information tags and CERPMs; bends of {RADII_M[0]:g} to "
-        f"{RADII_M[1]:g} m radius; one core. The longest has {counts} and {last.findings} findings.\n\n"
-        f"{table(head, rows)}\n\n{goals} from the second longest to the longest: {growth:.2f}."
+        "Two-lane road with plates, line magnets, information tags and CERPMs; bends with radii of "
+        f"{RADII_M[0]:g} to {RADII_M[1]:g} m; one core. The longest road has {counts} and {last.findings} findings.\n\n"
+        f"{table(head, rows)}\n\n{goals}"
     )
     return Section("planning-speed", text, last.total_s <= limit_s and growth <= GROWTH)
 

@@ -127,46 +127,49 @@ def main() -> None:
 
 
 _TRIALS_NOTE = (
-    f"Frames per drive, mean over the seeds. In view: all corners are inside the frame, and the plate is at least "
-    f"{MIN_ROWS:g} rows high. Frames in which it has fewer than {RENDERED_ROWS:g} rows count as not decoded and are "
-    "not processed. Every seed must meet the goal ('minimum')."
+    "Frames per drive, mean over the seeds. A plate is in view if all its corners are inside the frame and it is at "
+    f"least {MIN_ROWS:g} rows high. Frames in which it has fewer than {RENDERED_ROWS:g} rows are not processed and "
+    "count as not decoded. Every seed must meet the goal, so 'minimum' is compared with it."
 )
-_PEERS_NOTE = "The same scenes with a tag of the plate's footprint, default parameters, one thread."
+_PEERS_NOTE = (
+    'The same scenes with a tag that has the plate\'s footprint; default parameters, one thread. The columns "plate" '
+    'and "peer\'s tag" count decoded frames.'
+)
 
 
 _ACCURACY_NOTE = (
-    "Over the frames decoded in the trials without a registry. By rows: with rolling shutters compensated. At the "
-    "limit: from true corners with the errors that they would have if the residuals of the pixels were independent. "
-    "Within 2 sigma: of the errors along the plate's axes, below two reported standard deviations (95.4 % of a normal "
-    "distribution)."
+    "Errors over the frames that were decoded in the trials without a registry. The table by rows has rolling "
+    'shutters compensated. "At the limit" is the error that would remain if the corners had only the errors that '
+    'follow from independent residuals of the pixels. "Within 2 sigma" is the share of errors along the plate\'s axes '
+    "that are below two reported standard deviations (95.4 % for a normal distribution)."
 )
 _SPEED_NOTE = "Processor time, not wall time. The decoders take turns on each frame."
 _STAGES_NOTE = "Mean milliseconds of each stage of the decoder, in a second run of the same frames."
 
 
 _LIGHT_NOTE = (
-    "Drives of five frames in which the plate has 12 to 90 rows, on a fair day but for one thing; position plates "
-    "without check digits. Stains are one to three ellipses of paint with half axes of 8 to 30 mm. Tags of the plate's "
-    "footprint in the same scenes. A drive is lost if no frame is read."
+    "Drives of five frames in which the plate has 12 to 90 rows, on a fair day with one disturbance each; position "
+    "plates without check digits. Stains are one to three ellipses of paint with half axes of 8 to 30 mm. The last two "
+    "columns count tags with the plate's footprint in the same scenes. A drive is lost if none of its frames is read."
 )
 _PRINT_NOTE = (
-    "Print grades of photos of plates with one fault each, and how the same plates are read in simulated passes by day "
-    "at 60 km/h: frames read with the registry and without it. Values are medians over the seeds; grades are all that "
-    "occurred."
+    "Print grades of photos of plates with one fault each, and the frames in which the same plates are read, with a "
+    "registry and alone (without one), in simulated passes by day at 60 km/h. Values are medians over the seeds; the "
+    "grades are all those that occurred."
 )
 
 
 _RELIABILITY_NOTE = (
-    "Readings without a registry: the confidence that they report, and the share of them that is right. All plates of "
-    "the stained sets are stained; the decoder assumes that one in fifty is."
+    "Readings without a registry: their mean confidence, and the share that is right. In the stained sets every plate "
+    "is stained, while the decoder assumes that one in fifty is."
 )
 
 
 _SCHEMES_NOTE = (
-    "Drives of five frames in which the plate has 12 to 90 rows, as in `light`; under stress, five places of 24 to 140 "
-    "rows. Every scheme and every tag is 325 mm wide, lies in the same place, and has the same stains. With registry: "
-    "twenty plates within 500 m. A drive is lost if no frame is read; the worst drive is that with the fewest frames "
-    "read."
+    "Drives of five frames in which the plate has 12 to 90 rows, as in the previous table of disturbances; in the set "
+    '"stress", five frames of 24 to 140 rows. Plates and tags are all 325 mm wide, lie in the same place and have the '
+    "same stains. The registry has twenty plates within 500 m. A drive is lost if none of its frames is read; the "
+    "worst drive is the one with the fewest frames read."
 )
 
 

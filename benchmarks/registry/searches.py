@@ -64,7 +64,7 @@ def measure_growth(
                 found[rows] = {
                     (name, kind): p50 for kind in registry.urls for name, (p50, _) in _measured(registry, kind).items()
                 }
-    print("### registry-growth\n\nMedian in the service layer [ms] by the number of markers.\n")
+    print("### registry-growth\n\nMedian time in the service layer [ms] by the number of markers.\n")
     print(f"| search | database | {' | '.join(f'{rows:,}' for rows in sizes)} |\n|---|---|{'---|' * len(sizes)}")
     for name, kind in found[sizes[-1]]:
         print(f"| {name} | {kind} | {' | '.join(f'{found[rows][name, kind]:.2f}' for rows in sizes)} |")

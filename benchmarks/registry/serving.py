@@ -88,7 +88,10 @@ def measure_boxes(registry: Registry, peer_folder: Path, seconds: float) -> bool
         _compare_answers(asked)
         timings = _take_turns(asked, seconds, registry.urls["PostgreSQL"])
     rows = len(registry.network.lon_deg)
-    print(f"### registry-boxes\n\n{rows:,} markers; pages of {PAGE} of {BOX_FEATURES} in a box; 16 connections.\n")
+    print(
+        f"### registry-boxes\n\n{rows:,} markers; each page has {PAGE} of the {BOX_FEATURES} markers in a box; "
+        "16 connections.\n"
+    )
     met = _print(timings, lambda name: GOALS[name.partition(", ")[2]])
     print()
     return met

@@ -35,9 +35,12 @@ def _soak(short: bool) -> str:
 
 PARTS: dict[str, tuple[str, Callable[[bool], str]]] = {
     "start": ("Start of a server, and its memory when it is idle", start.tables),
-    "throughput": ("Throughput beside two bare decoder processes", _throughput),
+    "throughput": ("Throughput, compared with two bare decoder processes", _throughput),
     "limits": ("Limits of the database, and what a fleet needs", limits.tables),
-    "overload": ("64 clients at once, and slow connections", overload.tables),
+    "overload": (
+        "Response times of a probe (GET) while 64 clients, or slow connections, load the server",
+        overload.tables,
+    ),
     "malformed": ("Damaged and hostile files through the upload routes", _malformed),
     "kills": ("kill -9 of every process of a service", kills.tables),
     "soak": ("An hour of load", _soak),

@@ -21,7 +21,10 @@ from benchmarks.track.vehicle import CAMERA_LATE_S, LOG_LATE_S, Recorded, instal
 def print_end_to_end(seeds: range) -> None:
     """Print a row for each drive."""
     print("### Files of a simulated vehicle through the real decoders, over HTTP\n")
-    print(f"170 m, clock of the camera {CAMERA_LATE_S} s behind, that of the packet log {LOG_LATE_S} s.\n")
+    print(
+        f"A drive of 170 m. The true offset of the camera's clock is {CAMERA_LATE_S} s, that of the packet log's clock "
+        f"{LOG_LATE_S} s.\n"
+    )
     print(
         "| seed | plates | tags | CERPMs | along [m] | across [m] | camera's clock [s] | log's clock [s] | fusing [s] |"
     )

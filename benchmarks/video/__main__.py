@@ -58,7 +58,8 @@ def main() -> None:
     pairs = [value for score in alone for value in score.correlations]
     if pairs:
         print(f"Correlation of two frames' residuals: median {np.median(pairs):.2f} over {len(pairs)} pairs.")
-    print(f"Wrong plates that the confidences without a registry expect: {sum(score.doubt for score in alone):.3f}.")
+    expected = sum(score.doubt for score in alone)
+    print(f"Expected number of wrong plates without a registry, by the reported confidences: {expected:.3f}.")
     for name, scores in rows.items():
         for score in scores:
             for missed in score.wrong:
