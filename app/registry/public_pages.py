@@ -42,7 +42,7 @@ damage_reports = sa.Table(
     sa.Column("photo_bytes", sa.BigInteger),
     sa.Column("status", sa.String(16), nullable=False),
     sa.Column("note", sa.String(500)),
-    sa.Column("item_id", ID, sa.ForeignKey("maintenance_items.id")),  # that the report was approved into
+    sa.Column("item_id", ID, sa.ForeignKey("maintenance_items.id")),  # that the report was added to
     sa.Column("decided_by", sa.String(200)),
     sa.Column("decided_at", UtcTime),
     sa.Column("created_at", UtcTime, nullable=False),
@@ -162,7 +162,7 @@ class StoredReport(NamedTuple):
     # `status`, `note`: new, approved or rejected; and why
     status: str
     note: str | None
-    item_id: str | None  # item of the work list that it was approved into
+    item_id: str | None  # item of the work list that it was added to
     decided_by: str | None
     decided_at: datetime | None
     created_at: datetime

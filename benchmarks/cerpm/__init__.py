@@ -1,1 +1,1 @@
-"""Lanes from CERPMs beside the paper's way and the vehicle's own track; their radio, forgeries, steering, speed."""
+"""Lanes from CERPMs beside the paper's method and the vehicle's own track; their radio, forgeries, steering, speed."""

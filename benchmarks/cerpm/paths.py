@@ -99,7 +99,7 @@ def run_path(seed: int, short: bool) -> Result:
     )
     head = (
         "markers", "Karlsruhe low", "Karlsruhe moderate", "TFHRC bend", "TFHRC low", "made", "all", "max [m]",
-        "coverage", "goal", "met", "paper's way", "own track",
+        "coverage", "goal", "met", "paper's method", "own track",
     )  # fmt: skip
     return note, head, rows
 
@@ -115,7 +115,7 @@ def list_scenes(seed: int, short: bool, item: int):  # type: ignore[no-untyped-d
 def add_errors(
     condition: Condition, lane: TrueLane, rng: np.random.Generator, ours: Tally, paper: Tally, own: Tally
 ) -> None:
-    """Errors of the path, of the paper's way and of the vehicle's own track on one drive."""
+    """Errors of the path, of the paper's method and of the vehicle's own track on one drive."""
     installed = scenes.install(lane, rng, condition.per_side)
     if condition.lose is not None:
         installed = condition.lose(installed, rng)
@@ -199,7 +199,7 @@ def run_spoof(seed: int, short: bool) -> Result:
                 f"all, <= 1 %{f', {goal}' if goal else ''}", met(good), f"{paper.rms_m:.2f}",
             )
         )  # fmt: skip
-    head = ("markers", "named", "others left out", "RMS [m]", "max [m]", "goal", "met", "paper's way")
+    head = ("markers", "named", "others left out", "RMS [m]", "max [m]", "goal", "met", "paper's method")
     return (
         "In each run, one marker sends a position that is 30 m off, in a random direction that does not put it on a "
         "boundary of the lane.",

@@ -37,7 +37,7 @@ def test_no_lane(markers, method):
 
 
 def test_one_row_without_sides_is_no_lane():
-    """The paper's way has no such check: it splits the row by rounding errors."""
+    """The paper's method has no such check: it splits the row by rounding errors."""
     markers = markers_at(np.c_[np.linspace(0, 100, 11), np.zeros(11)], 0)
     assert_refused(fit_lane(markers, method="waymark"), markers)
 

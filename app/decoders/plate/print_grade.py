@@ -301,7 +301,7 @@ def _unused(evidence: PrintEvidence) -> PrintParameter:
         PrintParameterName.UNUSED_ERROR_CORRECTION,
         _unused_share(code, differs),
         f"{int(differs.sum())} of {len(differs)} cells have a wrong unit, which error correction must make good",
-        "print the wrong units again: what is wrong when new is not left for dirt",
+        "print the wrong units again: dirt and wear need the margin of a print that is right when new",
     )
 
 

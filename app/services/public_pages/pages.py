@@ -152,7 +152,7 @@ class PublicPageDocument(TypedDict):
 class DamageReport(TypedDict):
     """A damage report from a public page, and what a person decided.
 
-    `item_id` is the item of the work list that it was approved into.
+    `item_id` is the item of the work list that it was added to.
     """
 
     id: str
