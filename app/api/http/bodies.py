@@ -318,7 +318,7 @@ def idempotency_of(request: Request, header: str | None, text: bytes, *files: Sp
 
 
 def form_body(
-    parts: dict[str, Any], declared_in: str, declaration: type[BaseModel], example: Any, **others: Any
+    parts: dict[str, Any], declared_in: str, declaration: type[BaseModel], example: object, **others: object
 ) -> dict[str, Any]:
     """OpenAPI description of a body that is a form: its first part is required, and one part is a declaration in JSON.
 

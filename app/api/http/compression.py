@@ -9,7 +9,6 @@ import re
 import zlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import anyio
 from anyio import to_thread
@@ -136,7 +135,7 @@ class Compressed:
         return made
 
 
-async def _in_turn(size_bytes: int, call: Callable[..., bytes], *arguments: Any) -> bytes:
+async def _in_turn(size_bytes: int, call: Callable[..., bytes], *arguments: object) -> bytes:
     """The result of a call, charged to the request; in a thread if there is much to do."""
     if size_bytes <= _THREAD_BYTES:
         return counted(call, *arguments)

@@ -165,6 +165,7 @@ _CLOSED = getattr(select, "POLLRDHUP", 0)
 """The client has closed its side, even where it sent more that nobody has read. Source: man 2 poll; Linux only, others
 report POLLHUP, which needs no flag."""
 Endpoint = Callable[..., Any]
+Transport = asyncio.BaseTransport | None  # of the connection of a request, where the server has one
 
 
 class Slots:
@@ -297,7 +298,7 @@ def _limit(per_min: float, owner: str) -> RateLimit:
 class _Admitted:
     """A request whose body is not yet read."""
 
-    def __init__(self, slots: Slots, agency_id: str, work: RequestWork, receive: Receive, transport: Any) -> None:
+    def __init__(self, slots: Slots, agency_id: str, work: RequestWork, receive: Receive, transport: Transport) -> None:
         self.slots, self.agency_id, self.work = slots, agency_id, work
         self._receive, self._transport = receive, transport
         self._watching: asyncio.TimerHandle | asyncio.Task[None] | None = None
@@ -337,7 +338,7 @@ _ADMITTED: ContextVar[_Admitted | None] = ContextVar("waymark_admitted", default
 
 @contextmanager
 def admitted(
-    slots: Slots, agency_id: str, timeout_s: float, receive: Receive, transport: Any = None
+    slots: Slots, agency_id: str, timeout_s: float, receive: Receive, transport: Transport = None
 ) -> Iterator[RequestWork]:
     """Account for a request, give its endpoint the server's slots, and stop its work when its client leaves.
 
@@ -353,7 +354,7 @@ def admitted(
             _ADMITTED.reset(token)
 
 
-def _is_disconnected(transport: Any) -> bool:
+def _is_disconnected(transport: Transport) -> bool:
     """Whether the client has closed a connection.
 
     While a further request of the client waits, uvicorn neither reads from the connection nor reports its end.
@@ -380,7 +381,7 @@ def bounded(endpoint: Endpoint, *, expensive: bool, watched: bool = True) -> End
         return endpoint
 
     @wraps(endpoint)
-    async def run(**values: Any) -> Response:
+    async def run(**values: object) -> Response:
         call = partial(counted, endpoint, **values)
         if watched:
             watch_client()

@@ -19,7 +19,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import tracing
-from app.api.http.limits import Budget, RateLimit, Slots, address_of, admitted
+from app.api.http.limits import Budget, RateLimit, Slots, Transport, address_of, admitted
 from app.api.http.permissions import Permissions, key_in
 from app.api.http.problems import BodyRefused, problem_from, unexpected
 from app.api.public_pages.texts import accepts_html
@@ -253,7 +253,7 @@ class Guarded:
         )
         return HTTPException(408, f"the body arrived too slowly: {limit} ({seen} bytes came)", {"Connection": "close"})
 
-    async def _answer(self, scope: Scope, receive: Receive, send: Send, transport: object) -> None:
+    async def _answer(self, scope: Scope, receive: Receive, send: Send, transport: Transport) -> None:
         """Let the app answer a request, and charge what that costs."""
         state = scope.get("state", {})
         agency_id: str = state.get("agency_id", "")

@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import ConfigDict, TypeAdapter, with_config
 from starlette.exceptions import HTTPException
+from starlette.types import Scope
 
 from app import errors
 from app.api.http.permissions import CHALLENGES
@@ -24,10 +25,10 @@ from app.services.documents import ErrorCause, cut_text, error_cause
 
 Mode = Literal["validation", "serialization"]
 _TEMPLATE = "#/components/schemas/{model}"
-_MODELS: dict[str, tuple[Any, Mode]] = {}
+_MODELS: dict[str, tuple[type, Mode]] = {}
 
 
-def reference(model: Any, mode: Mode = "validation") -> dict[str, str]:
+def reference(model: type, mode: Mode = "validation") -> dict[str, str]:
     """A reference to the schema of a model, which becomes part of the document."""
     _MODELS[model.__name__] = model, mode
     return {"$ref": _TEMPLATE.format(model=model.__name__)}
@@ -44,7 +45,9 @@ def with_reference(response: dict[str, Any]) -> dict[str, Any]:
 
 def component_schemas() -> dict[str, Any]:
     """The schemas of all models that are referred to, and of the models within them, by name."""
-    adapters = [(name, mode, TypeAdapter(model)) for name, (model, mode) in _MODELS.items()]
+    adapters: list[tuple[str, Mode, TypeAdapter[object]]] = [
+        (name, mode, TypeAdapter(model)) for name, (model, mode) in _MODELS.items()
+    ]
     _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE)
     found: dict[str, Any] = schemas["$defs"]
     return found
@@ -203,7 +206,7 @@ def kind_of(error: errors.WaymarkError) -> ProblemKind | None:
 def problem(
     kind: ProblemKind,
     detail: str,
-    scope: Any,
+    scope: Scope,
     faults: list[FieldError] | None = None,
     headers: dict[str, str] | None = None,
     left_out: int = 0,
@@ -224,13 +227,13 @@ def problem(
     return as_page(response, scope)
 
 
-def report_problem(slug: str, title: str, fault: FieldError, scope: Any, report: object) -> Response:
+def report_problem(slug: str, title: str, fault: FieldError, scope: Scope, report: object) -> Response:
     """The response to a request that was refused with a report of everything that is wrong with it."""
     body = _document(ProblemKind(422, slug, title), fault.detail, scope)
     return Response(orjson.dumps({**body, **_cause(fault), "report": report}), 422, media_type=MEDIA_TYPE)
 
 
-def _document(kind: ProblemKind, detail: str, scope: Any) -> Problem:
+def _document(kind: ProblemKind, detail: str, scope: Scope) -> Problem:
     document: Problem = {
         "type": kind.type,
         "title": kind.title,
@@ -251,7 +254,7 @@ def _cut(text: str) -> str:
     return cut_text(text, MAX_TEXT_BYTES)
 
 
-def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
+def problem_from(error: errors.WaymarkError, scope: Scope) -> Response:
     """The response to a domain error; an error that is in no table is a bug of Waymark."""
     kind = kind_of(error)
     if kind is None:
@@ -263,7 +266,7 @@ def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
     return problem(kind, error.message, scope, faults, wait)
 
 
-def unexpected(error: Exception, scope: Any) -> Response:
+def unexpected(error: Exception, scope: Scope) -> Response:
     """The response to a bug: the details are in the log, the client gets only the request's id.
 
     A full disk is no bug: requests and responses pass through temporary files at many places.
@@ -342,7 +345,7 @@ def validation_fault(item: Mapping[str, Any]) -> FieldError:
     )
 
 
-def _protocol(scope: Any) -> dict[str, str]:
+def _protocol(scope: Scope) -> dict[str, str]:
     """Every response to a client of tus names the version of the protocol (tus 1.0, "Tus-Resumable")."""
     is_tus = any(name == b"tus-resumable" for name, _value in scope.get("headers", ()))
     return {"Tus-Resumable": "1.0.0", "Tus-Version": "1.0.0"} if is_tus else {}

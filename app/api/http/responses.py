@@ -82,7 +82,7 @@ def text_response(media_type: str, description: str = "The text", status: int = 
     return {status: {"description": description, "content": {media_type: {"schema": {"type": "string"}}}}}
 
 
-def document_response(model: Any, *problems: int, status: int = 200, description: str | None = None) -> Described:
+def document_response(model: object, *problems: int, status: int = 200, description: str | None = None) -> Described:
     """A response that is a document, with the problems that the route can return besides those of every /v1 route."""
     described = {"model": model} if description is None else {"model": model, "description": description}
     return {status: described, **problem_responses(*problems)}

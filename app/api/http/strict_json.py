@@ -38,7 +38,7 @@ async def in_thread_if_large(size_bytes: int, read: Callable[[], T]) -> T:
     return await asyncio.get_running_loop().run_in_executor(_READER, lambda: context.run(counted, read))
 
 
-def read_body(body: TypeAdapter[Any], raw: bytes) -> Any:
+def read_body(body: TypeAdapter[T], raw: bytes) -> T:
     """A JSON body as a model; errors as of `parse_json` and `validated`."""
     return validated(body, parse_json(raw), "body")
 
@@ -74,7 +74,7 @@ def _located(fault: ErrorDetails, where: tuple[str, ...], names: Collection[str]
 
 
 @cache
-def _names_in(adapter: TypeAdapter[Any]) -> tuple[str, ...]:
+def _names_in(adapter: TypeAdapter[object]) -> tuple[str, ...]:
     """Names of all members of a model and of the models in it."""
     schema = adapter.json_schema()
     return tuple(

@@ -342,7 +342,7 @@ class ReadDescription(TypedDict):
 
 
 def describe_read(
-    model: Any, media_type: str = JSON, *, html: bool = True, parameters: tuple[str, ...] = ONLY_FORMAT
+    model: type, media_type: str = JSON, *, html: bool = True, parameters: tuple[str, ...] = ONLY_FORMAT
 ) -> ReadDescription:
     """Describe a route that returns a document, unless it has no `html` as a page, too.
 
