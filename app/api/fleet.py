@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request, Response
-from pydantic import ConfigDict, Field, JsonValue, field_validator
+from pydantic import ConfigDict
 
-from app.api.decodes.schemas import CameraIn, FramesIn, PacketsIn, TraceIn
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, idempotency_of, read_declaration
 from app.api.http.dependencies import (
     AfterVersion,
@@ -17,11 +16,9 @@ from app.api.http.dependencies import (
     Idempotency,
     Identifier,
     LastId,
-    Number,
     PageSize,
     Text,
     Version,
-    Whole,
     use_case,
 )
 from app.api.http.permissions import ADMINS, EVERYBODY, PLANNERS, READERS, SURVEYORS
@@ -39,12 +36,12 @@ from app.api.http.responses import (
 from app.api.http.routes import Router
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
-from app.errors import InvalidParameter, UnreadableUpload
-from app.families.documents import Flag, StrictModel
+from app.errors import UnreadableUpload
+from app.families.documents import StrictModel
 from app.formats.format import SpooledFile
 from app.markers.snapshot import MEDIA_TYPE
 from app.sensors.camera import CalibrationBoard
-from app.services.fleet.calibrations import Calibrations
+from app.services.fleet.calibrations import DECLARATION_EXAMPLE, CalibrationDeclaration, Calibrations
 from app.services.fleet.documents import (
     CalibrationDocument,
     CalibrationPage,
@@ -58,39 +55,9 @@ from app.services.fleet.documents import (
 from app.services.fleet.snapshots import MAX_HOURS
 from app.services.fleet.snapshots import Snapshots as SnapshotsService
 from app.services.fleet.tasks import MAX_PHOTOS
-from app.services.fleet.vehicles import VehicleChange, Vehicles
+from app.services.fleet.vehicles import NewVehicle, VehicleChange, Vehicles
 from app.services.idempotency import IdempotencyKey
 from app.services.markers.searches import parse_box
-
-# === Schemas of calibration boards and calibrations.
-
-
-DECLARATION_EXAMPLE: dict[str, JsonValue] = {
-    "board": {"columns": 7, "rows": 10, "square_mm": 25.0, "marker_mm": 18.0},
-}
-
-
-class BoardIn(StrictModel):
-    """A board: squares across and down, the upper left one black, and their sides as measured on the print."""
-
-    columns: Whole = Field(7, description="Squares across, 4 to 24.")
-    rows: Whole = Field(10, description="Squares down, 4 to 24; at most 200 squares.")
-    square_mm: Number = Field(25.0, description="Side of a square, 8 to 250. [mm]")
-    marker_mm: Number = Field(18.0, description="Side of a marker, 0.5 to 0.85 of a square. [mm]")
-
-    def calibration_board(self) -> CalibrationBoard:
-        """The board as the core knows it."""
-        return CalibrationBoard(self.columns, self.rows, self.square_mm, self.marker_mm)
-
-
-class CalibrationIn(StrictModel):
-    """What is declared of the photos."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [DECLARATION_EXAMPLE]})
-
-    board: BoardIn = Field(default_factory=BoardIn)
-    coefficients: Annotated[Literal[4, 5, 8] | None, Field(description="Of the distortion; chosen if left out.")] = None
-
 
 # === /v1/calibration-boards: boards to print; /v1/calibrations: photos of them -> the camera's intrinsics.
 
@@ -109,7 +76,7 @@ _BODY = form_body(
         }
     },
     "declaration",
-    CalibrationIn,
+    CalibrationDeclaration,
     {"photos": ["1.jpg", "2.jpg"], "declaration": DECLARATION_EXAMPLE},
 )
 
@@ -117,7 +84,7 @@ _BODY = form_body(
 @dataclass(frozen=True, slots=True)
 class _Asked:
     photos: tuple[tuple[str, SpooledFile], ...]
-    declared: CalibrationIn
+    declared: CalibrationDeclaration
     idempotency: IdempotencyKey | None
 
 
@@ -143,7 +110,7 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
             if isinstance(file, SpooledPart)
         ]
         key = idempotency_of(request, idempotency_key, text, *(file for _name, file in photos))
-        yield _Asked(tuple(photos), await read_declaration(CalibrationIn, text, "declaration"), key)
+        yield _Asked(tuple(photos), await read_declaration(CalibrationDeclaration, text, "declaration"), key)
 
 
 CalibrationService = Annotated[Calibrations, use_case(lambda cases: cases.calibrations)]
@@ -190,9 +157,7 @@ def post_calibration(caller: Caller, asked: Asked, calibrations: CalibrationServ
     What is not good enough is refused with a named reason. `PUT /v1/vehicles/{id}/calibration` puts the result into a
     vehicle's camera. The photos are not kept.
     """
-    document, replayed = calibrations.run(
-        caller, asked.photos, asked.declared.board.calibration_board(), asked.declared.coefficients, asked.idempotency
-    )
+    document, replayed = calibrations.run(caller, asked.photos, asked.declared, asked.idempotency)
     return created_response(document, replayed, path="/v1/calibrations")
 
 
@@ -227,109 +192,7 @@ def get_calibration(
     return json_response(calibrations.get(caller, calibration_id))
 
 
-# === Schemas of vehicles and their sensor profiles: a profile has the members of a decode's context.
-
-
-Name = Annotated[Text, Field(min_length=1, max_length=80)]
-Note = Annotated[Text, Field(max_length=500)]
-
-PROFILE_EXAMPLE: dict[str, JsonValue] = {
-    "camera": {
-        "width_px": 1920, "height_px": 1080, "fx_px": 1371.0, "fy_px": 1371.0, "cx_px": 959.5, "cy_px": 539.5,
-        "height_m": 1.57, "depression_deg": 23.0, "forward_m": 1.2,
-    },
-    "trace": {"axes": "FRD", "unit": "uT", "bar": {"forward_m": 0.4}, "rate_hz": 350.0},
-    "packets": {
-        "receiver": {"sensitivity_dbm": -129.0, "antenna_height_m": 1.6},
-        "poses": {"forward_m": 0.9, "left_m": 0.0, "accuracy_m": 0.5},
-    },
-}  # fmt: skip
-
-
-class VehicleCameraIn(CameraIn):
-    """A vehicle's camera: that of a context; intrinsics may come later, from a calibration."""
-
-    calibration_id: Identifier | None = Field(None, description="Calibration that the intrinsics are of.")
-
-
-class ProfileIn(StrictModel):
-    """What stays the same from upload to upload, in the members of a decode's context."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [PROFILE_EXAMPLE]})
-
-    camera: VehicleCameraIn | None = None
-    thermal: Flag | None = Field(None, description="The camera is thermal.")
-    thermal_range: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
-        None, description="Counts of 16-bit thermal frames that become 0 and 255."
-    )
-    frames: FramesIn | None = Field(None, description="Rate and clock of the frames of drives.")
-    trace: TraceIn | None = Field(None, description="Magnetometer bar, axes, unit and rate; {} for METRO's own.")
-    packets: PacketsIn | None = Field(None, description="Receiver, poses and clock of packet logs; {} for the usual.")
-
-    def values(self) -> dict[str, Any]:
-        """The values that the request sets."""
-        return self.model_dump(exclude_unset=True, exclude_none=True)
-
-    def sections(self) -> dict[str, Any]:
-        """Sections that the request names; None for those that are removed."""
-        values = self.values()
-        return {name: values.get(name) for name in self.model_fields_set}
-
-
-def _checked_name(name: str) -> str:
-    if name != name.strip() or not name.isprintable() or (len(name) == 36 and name.count("-") == 4):
-        raise InvalidParameter(
-            "a vehicle's name is printable, does not begin or end with a space, and is no id",
-            field="name",
-            limit="1 to 80 printable characters",
-            cure="send a fleet number or a plate, e.g. BUS-7",
-        )
-    return name
-
-
-class VehicleIn(StrictModel):
-    """A vehicle of the fleet."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [{"name": "BUS-7", "profile": PROFILE_EXAMPLE}]})
-
-    name: Name = Field(description="What uploads call it; each name once in an agency.")
-    note: Note | None = Field(None, description="Make, number plate, whatever distinguishes it.")
-    profile: ProfileIn = Field(default_factory=ProfileIn)
-
-    @field_validator("name")
-    @classmethod
-    def _name(cls, name: str) -> str:
-        return _checked_name(name)
-
-
-class VehiclePatch(StrictModel):
-    """Members to change. A section of the profile is replaced as a whole; one that is null is taken out."""
-
-    model_config = ConfigDict(
-        json_schema_extra={"examples": [{"profile": {"trace": {"axes": "FRD", "unit": "uT"}}, "reason": "new bar"}]},
-    )
-
-    name: Name = Field("", description="New name.")
-    status: VehicleStatus = Field("active", description="A retired vehicle's uploads are refused.")
-    note: Note | None = Field(None, description="New note; null clears it.")
-    profile: ProfileIn = Field(default_factory=ProfileIn)
-    reason: Note | None = Field(None, description="Why; appears in the history.")
-
-    @field_validator("name")
-    @classmethod
-    def _name(cls, name: str) -> str:
-        return _checked_name(name)
-
-    def change(self) -> VehicleChange:
-        """The change as the use cases know it."""
-        named = self.model_fields_set
-        values = self.model_dump(include=named & {"name", "status", "note"})
-        profile = self.profile.sections() if "profile" in named else {}
-        if not values and not profile:
-            raise InvalidParameter(
-                "the patch changes nothing", field="body", limit="at least one member", cure="name what to change"
-            )
-        return VehicleChange(values, profile, self.reason)
+# === /v1/vehicles: the fleet, its sensor profiles and the keys that speak for it.
 
 
 class CalibrationChoice(StrictModel):
@@ -340,9 +203,6 @@ class CalibrationChoice(StrictModel):
     )
 
     calibration_id: Identifier
-
-
-# === /v1/vehicles: the fleet, its sensor profiles and the keys that speak for it.
 
 
 vehicle_router = Router("/v1/vehicles", "fleet")
@@ -358,12 +218,12 @@ VehicleService = Annotated[Vehicles, use_case(lambda cases: cases.vehicles)]
     status_code=201,
     responses=document_response(VehicleDocument, 404, 409, status=201, description="Added"),
 )
-def post_vehicle(vehicle: VehicleIn, caller: Caller, vehicles: VehicleService, idempotency: Idempotency) -> Response:
+def post_vehicle(vehicle: NewVehicle, caller: Caller, vehicles: VehicleService, idempotency: Idempotency) -> Response:
     """Add a vehicle with its sensor profile.
 
     Uploads that name it inherit the profile.
     """
-    document, replayed = vehicles.add(caller, vehicle.name, vehicle.profile.values(), vehicle.note, idempotency)
+    document, replayed = vehicles.add(caller, vehicle, idempotency)
     return created_response(document, replayed, path="/v1/vehicles")
 
 
@@ -395,13 +255,13 @@ def get_vehicle(vehicle_id: VehicleId, caller: Caller, vehicles: VehicleService)
 
 @vehicle_router.patch("/{vehicle_id}", PLANNERS, responses=document_response(VehicleDocument, 404, 409, 412, 428))
 def patch_vehicle(
-    vehicle_id: VehicleId, patch: VehiclePatch, caller: Caller, vehicles: VehicleService, version: Version
+    vehicle_id: VehicleId, patch: VehicleChange, caller: Caller, vehicles: VehicleService, version: Version
 ) -> Response:
     """Change a vehicle.
 
     One that is still at the version named by If-Match.
     """
-    return versioned_response(vehicles.change(caller, vehicle_id, patch.change(), version))
+    return versioned_response(vehicles.change(caller, vehicle_id, patch, version))
 
 
 @vehicle_router.delete("/{vehicle_id}", PLANNERS, status_code=204, responses=problem_responses(404, 412, 428))

@@ -16,7 +16,6 @@ from anyio import to_thread
 from fastapi import Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.decodes.schemas import ContextIn
 from app.api.decodes.uploads import context_of, with_vehicle
 from app.api.http.bodies import append, finish, media_type_of, read_declaration, spool_of
 from app.api.http.dependencies import Caller, Identifier, use_case
@@ -33,6 +32,7 @@ from app.errors import (
     WrongChecksum,
 )
 from app.formats.format import SpooledFile
+from app.services.decodes.declarations import UploadContext
 from app.services.uploads.quotas import UploadDocument
 from app.services.uploads.uploads import Grant, Uploads
 from app.services.uploads.uploads import Uploads as UploadsService
@@ -284,7 +284,7 @@ class PartsIn(BaseModel):
     method: Literal["s3-parts"]
     size: int = Field(gt=0, lt=2**50, description="Of the whole file. [byte]")
     file_name: str = Field(default="", max_length=200)
-    context: ContextIn | None = None
+    context: UploadContext | None = None
 
 
 class CompleteIn(BaseModel):
@@ -299,8 +299,9 @@ class CompleteIn(BaseModel):
 
 async def _started_parts(request: Request, caller: Caller, uploads: Service) -> Response:
     wanted = await read_declaration(PartsIn, await request.body(), "body")
-    context = (wanted.context or ContextIn()).context_input(wanted.file_name)
-    made, urls = await in_thread(partial(uploads.create_parts, caller, wanted.size, context))
+    made, urls = await in_thread(
+        partial(uploads.create_parts, caller, wanted.size, wanted.context or UploadContext(), wanted.file_name)
+    )
     document: UploadDocument = {**made, "part_bytes": PART_BYTES, "part_urls": urls}
     return json_response(document, 201, {"Location": f"/v1/uploads/{made['id']}"})
 
@@ -321,13 +322,13 @@ async def _started(request: Request, caller: Caller, uploads: Service) -> Upload
         checksum = read_checksum(request) if has_part else None
         metadata = read_metadata(request)
         name = metadata.get("filename", b"").decode("utf-8", "replace")[:200]
-        context = await context_of(metadata.get("context", b""), name)
+        context = await context_of(metadata.get("context", b""))
         if vehicle := metadata.get("vehicle", b"").decode("utf-8", "replace"):
             context = with_vehicle(context, vehicle)
         if length == 0:
             raise MalformedRequest("the file is empty", field="Upload-Length", limit="1 byte or more")
         spool_of(request).check_room(length)
-        document = await in_thread(partial(uploads.create, caller, length, context))
+        document = await in_thread(partial(uploads.create, caller, length, context, name))
     except WaymarkError as error:
         raise BodyRefused(error) from error
     if not has_part:

@@ -160,16 +160,15 @@ def decode_trace(
     """Decode the magnets and tags in a magnetometer trace, and print one JSON object."""
     import orjson
 
-    from app.api.decodes.schemas import TraceIn
     from app.decoders.magnet.identify import match_tags
     from app.formats.format import SpooledFile
-    from app.services.decodes.declarations import trace_terms
+    from app.services.decodes.declarations import DeclaredTrace
     from app.services.decodes.trace_documents import trace_document
     from app.services.decodes.trace_tasks import decode_recording
 
-    terms = read_declaration(TraceIn, declared, "docs/magnets.md").model_dump(exclude_unset=True)
+    terms = read_declaration(DeclaredTrace, declared, "docs/magnets.md")
     result = decode_recording(recording.name, SpooledFile.at(recording), terms)
-    trace = match_tags(result.findings, (), trace_terms(terms).bar)
+    trace = match_tags(result.findings, (), terms.sensors)
     if plot is not None:
         plot.write_bytes(result.plot)
     document = trace_document(result, trace, codebook_tags=0)

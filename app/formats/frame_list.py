@@ -117,11 +117,11 @@ def read_frame_list(name: str, data: bytes, declaration: PoseDeclaration | None 
 
 
 def _csv_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator[tuple[int, dict[str, object] | None]]:
-    sample = Sample(name, data, declaration.columns)
+    sample = Sample(name, data, declaration.columns or {})
     if not sample.is_text:
         raise UnreadableUpload(f"{name} is no text", field="file", cure="save the list of frames as CSV")
     log = sample.log
-    places = log.places(_ALIASES, declaration.columns)
+    places = log.places(_ALIASES, declaration.columns or {})
     if "file" not in places:
         shown = ", ".join(repr(clean_text(column, 40)) for column in log.columns[:24])
         raise InvalidParameter(
@@ -159,7 +159,7 @@ def _json_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator
             yield entry, None
             continue
         names = tuple(str(key)[:64] for key in row)[:256]
-        places = match_columns(names, _ALIASES, declaration.columns)
+        places = match_columns(names, _ALIASES, declaration.columns or {})
         cells = list(row.values())
         yield entry, {quantity: cells[place] for quantity, place in places.items()}
 
@@ -175,7 +175,7 @@ def _frame_of(values: Mapping[str, object], declaration: PoseDeclaration) -> Lis
     accuracy_m, heading_deg = number("accuracy"), number("heading")
     return ListedFrame(
         _last(name) if isinstance(name, str) else "",
-        declaration.clock.read(values.get("time")),
+        declaration.times.read(values.get("time")),
         number("lon"),
         number("lat"),
         heading_deg % 360.0,

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
 
-from app.errors import InvalidParameter
+from pydantic import Field
+
+from app.inputs import Declaration, Number
 
 # === The report about reading an uploaded log: entries, entries left out, warnings.
 
@@ -89,31 +91,20 @@ _SCALE_S = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class LogClock:
-    """How the times of a log are read.
+class LogClock(Declaration):
+    """How the times of a file are read."""
 
-    Raises
-    ------
-    InvalidParameter
-        An offset is not finite, or local time is more than 14 hours from UTC.
-    """
-
-    # of numbers; `auto` distinguishes seconds, ms, us and ns since 1970 by their size
-    scale: TimeScale = TimeScale.AUTO
-    offset_s: float = 0.0  # [s] added to each time: the true time less the log's clock
-    utc_offset_s: float = 0.0  # [s] of texts without a zone: local time less UTC
-
-    def __post_init__(self) -> None:
-        if not math.isfinite(self.offset_s):
-            raise InvalidParameter("the clock's offset is not finite", field="clock.offset_s", limit="finite seconds")
-        if not abs(self.utc_offset_s) <= 14 * 3600:
-            raise InvalidParameter(
-                f"local time is {self.utc_offset_s} s from UTC",
-                field="clock.utc_offset_s",
-                limit="-50400 to 50400 s",
-                cure="give the zone's offset in seconds, e.g. -18000 for UTC-5",
-            )
+    scale: TimeScale = Field(
+        TimeScale.AUTO,
+        description="Of times that are numbers; `auto` distinguishes s, ms, us and ns since 1970 by their size.",
+    )
+    offset_s: Number = Field(0.0, description="Added to each time: the true time less the log's clock. [s]")
+    utc_offset_s: Number = Field(
+        0.0,
+        ge=-14 * 3600,
+        le=14 * 3600,
+        description="Of times without a zone: local time less UTC, e.g. -18000 for UTC-5. [s]",
+    )
 
     def read(self, value: object) -> float:
         """Seconds since 1970-01-01 UTC; NaN where there is no time between 2000 and 2100. [s]"""

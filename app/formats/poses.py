@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime, time, timedelta
+from functools import cached_property
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter, ReferenceSystemError, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, list_accepted
@@ -20,6 +23,7 @@ from app.formats.logs import LogClock, LogReport, has_zone
 from app.formats.text import clean_text, numbered_lines, read_number
 from app.geodesy import place_position, reference_system
 from app.geodesy.systems import is_global
+from app.inputs import Declaration, Name, Number
 from app.sensors.pose_track import PoseTrack
 
 if TYPE_CHECKING:
@@ -78,26 +82,36 @@ ALIASES: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class PoseDeclaration:
-    """What the uploader declares of a track; everything is optional."""
+class PoseDeclaration(Declaration):
+    """What is declared of the vehicle's track."""
 
-    clock: LogClock = field(default_factory=LogClock)
-    # names of columns in place of the usual ones: time, lon, lat, heading, accuracy, crs
-    columns: Mapping[str, str] = field(default_factory=dict)
-    crs: str | None = None  # coordinate reference system of the positions; WGS 84 without
-    date: date | None = None  # UTC date of the first position, for NMEA without dates
-    # `forward_m`, `left_m`: [m] position of the antenna from the vehicle's reference point (ISO 8855)
-    forward_m: float = 0.0
-    left_m: float = 0.0
-    accuracy_m: float | None = None  # [m] standard deviation of a position where the track has none
+    clock: LogClock | None = None
+    columns: dict[Name, Name] | None = Field(
+        None, max_length=12, description="Names of columns: time, lon, lat, heading, accuracy, crs."
+    )
+    crs: Name | None = Field(None, description="WGS 84 if left out; others are refused.")
+    date: dt.date | None = Field(None, description="UTC date of the first position, for NMEA without dates.")
+    forward_m: Number | None = Field(
+        None, ge=-100, le=100, description="Of what was positioned, ahead of the vehicle's reference point. [m]"
+    )
+    left_m: Number | None = Field(
+        None, ge=-100, le=100, description="Of what was positioned, left of the vehicle's reference point. [m]"
+    )
+    accuracy_m: Number | None = Field(
+        None, gt=0, le=1000, description="Standard deviation of a position where the track has none. [m]"
+    )
 
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.columns) - set(ALIASES))
-        if unknown:
-            raise InvalidParameter(
-                f"there is no quantity {unknown[0]!r} in a track", field="poses.columns", limit=", ".join(ALIASES)
-            )
+    @field_validator("columns")
+    @classmethod
+    def _quantities(cls, columns: dict[str, str] | None) -> dict[str, str] | None:
+        if unknown := sorted(set(columns or ()) - set(ALIASES)):
+            raise InvalidParameter(f"there is no quantity {unknown[0]!r} in a track", limit=", ".join(ALIASES))
+        return columns
+
+    @cached_property
+    def times(self) -> LogClock:
+        """How its times are read."""
+        return self.clock or LogClock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +254,7 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
         A row has another datum.
     """
     name, log, report, declaration = source.sample.name, source.sample.log, source.report, source.declaration
-    places = log.places(ALIASES, declaration.columns)
+    places = log.places(ALIASES, declaration.columns or {})
     missing = [quantity for quantity in NEEDED if quantity not in places]
     if missing:
         shown = ", ".join(repr(clean_text(c, 40)) for c in log.columns[:24])
@@ -258,7 +272,7 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
             report.leave_out(entry, "malformed", log.bad_row())
             continue
         try:
-            point = _point_of(entry, cells, places, declaration.clock, log.dialect.decimal)
+            point = _point_of(entry, cells, places, declaration.times, log.dialect.decimal)
         except (ValueError, OverflowError):
             report.leave_out(entry, "malformed", "the row holds text where numbers are expected")
             continue
@@ -268,7 +282,7 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
             datums.add(cells[places["crs"]])
         zoned = zoned and (":" not in cells[places["time"]] or has_zone(cells[places["time"]]))
         yield point
-    if not zoned and not declaration.clock.utc_offset_s:
+    if not zoned and not declaration.times.utc_offset_s:
         report.warn("times without a zone were taken as UTC; declare the zone's offset if they are local")
 
 
@@ -331,7 +345,7 @@ def read_gpx(source: PoseSource) -> Iterator[PosePoint]:
         at = point.time
         written = None if at is None else at.isoformat()
         yield PosePoint(
-            entry, source.declaration.clock.read(written), float(point.longitude), float(point.latitude), _course(point)
+            entry, source.declaration.times.read(written), float(point.longitude), float(point.latitude), _course(point)
         )
 
 
@@ -436,7 +450,7 @@ def read_nmea(source: PoseSource) -> Iterator[PosePoint]:
             _take(entry, kind, parsed, reading)
         except AttributeError:  # a cut sentence has no such field
             report.leave_out(entry, "malformed", f"a {kind} sentence with fields missing")
-    yield from _points(reading.epochs, declaration.clock, declaration.date, report)
+    yield from _points(reading.epochs, declaration.times, declaration.date, report)
 
 
 def _find_sentences(text: str, report: LogReport) -> Iterator[tuple[int, str, str, str]]:
@@ -667,7 +681,7 @@ def read_poses(
     if len(data) > limits.file_bytes:
         raise UploadTooLarge(f"{name} has {len(data)} bytes", field=FIELD, limit=f"{limits.file_bytes} bytes")
     report = LogReport()
-    source = PoseSource(Sample(name, data, declaration.columns), declaration, limits, report)
+    source = PoseSource(Sample(name, data, declaration.columns or {}), declaration, limits, report)
     points = list(islice(_read_any(source), limits.points + 1))
     if len(points) > limits.points:
         raise too_many_points(name, limits)
@@ -680,7 +694,7 @@ def read_poses(
     if declaration.forward_m or declaration.left_m:
         if not np.isfinite(track.heading_deg).any():
             report.warn("there is no heading: positions stay where they were measured, off the vehicle's reference")
-        track = track.moved(-declaration.forward_m, -declaration.left_m)
+        track = track.moved(-(declaration.forward_m or 0.0), -(declaration.left_m or 0.0))
     return track, report
 
 

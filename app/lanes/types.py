@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from app.errors import InvalidParameter
+from app.inputs import Declaration
 from app.markers.cerpm import LaneSide
 
 # === The planned place of a marker on a boundary of a lane.
@@ -77,36 +79,39 @@ class LaneMarkers:
         return len(self.number)
 
 
-@dataclass(frozen=True, slots=True)
-class LaneRules:
-    """Limits of the lane estimate. All are checked to be positive and finite."""
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
-    # [m] lane width where only one side is known
-    usual_width_m: float = 3.3  # [m] 11 ft; lanes are 9 to 12 ft wide (AASHTO Green Book, 4.3)
-    # `off_the_line_m`, `off_the_line_z`: a marker is left out if the line through its neighbours is at least this far
-    # away, both in metres and in standard deviations. [m, 1]
-    off_the_line_m: float = 0.6  # [m] sensitivity 1.00, 0.99
-    off_the_line_z: float = 5.0  # sensitivity 1.00, 0.99
+
+class LaneDeclaration(Declaration):
+    """Rules for the lane's estimation."""
+
+    # 11 ft; lanes are 9 to 12 ft wide (AASHTO Green Book, 4.3)
+    usual_width_m: Positive = Field(3.3, description="Width where only one side is known. [m]")
+    # with `off_the_line_z` of `LaneRules`; sensitivity 1.00, 0.99
+    off_the_line_m: Positive = Field(
+        0.6, description="A marker that is farther from its neighbours' line is left out. [m]"
+    )
+    # sensitivity 1.00, 1.00
+    bridge_m: Positive = Field(150.0, description="Without a track, the widest stretch without a marker. [m]")
+
+
+class LaneRules(LaneDeclaration):
+    """Limits of the lane estimate."""
+
+    # a marker is left out if it is also this many standard deviations off its neighbours' line
+    off_the_line_z: Positive = 5.0  # sensitivity 1.00, 0.99
     # [m] two positions of one marker number further apart than this are two places
-    same_place_m: float = 0.3  # [m] a survey of 0.1 m at three sigma
+    same_place_m: Positive = 0.3  # [m] a survey of 0.1 m at three sigma
     # [m] how far past the outermost markers the path follows the vehicle's track
-    reach_m: float = 25.0  # [m] two spacings of the paper's 12.2 m
+    reach_m: Positive = 25.0  # [m] two spacings of the paper's 12.2 m
     # [m] past the outermost markers, the path ends where its standard deviation exceeds this
-    max_end_sigma_m: float = 0.5  # [m] sensitivity 1.00, 1.00
-    # [m] without a track, the longest stretch without a marker that the path bridges
-    bridge_m: float = 150.0  # [m] sensitivity 1.00, 1.00
+    max_end_sigma_m: Positive = 0.5  # [m] sensitivity 1.00, 1.00
     # [m] the lane is refused if the median standard deviation of its stations exceeds this
-    max_median_sigma_m: float = 1.0  # [m] sensitivity 1.00, 1.00
+    max_median_sigma_m: Positive = 1.0  # [m] sensitivity 1.00, 1.00
     # the lane is refused if more than this share of the markers lies off the line
-    max_outlier_ratio: float = 0.25  # sensitivity 1.00, 1.00
+    max_outlier_ratio: Positive = 0.25  # sensitivity 1.00, 1.00
     # [m] Confidence is the probability that the path is within this distance of the lane's centre
-    tolerance_m: float = 0.25  # [m] source: the definition of confidence (docs/nomenclature.md)
-
-    def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidParameter(f"{name} is {value}", field=f"rules.{name}", limit="positive and finite")
+    tolerance_m: Positive = 0.25  # [m] source: the definition of confidence (docs/nomenclature.md)
 
 
 class LeftOutReason(StrEnum):

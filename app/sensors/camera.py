@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict, Field, with_config
 
 from app.errors import InvalidParameter
+from app.inputs import Declaration, Number, Whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,20 +54,7 @@ class Camera:
             )
 
     @classmethod
-    def from_field_of_view(
-        cls,
-        width_px: int,
-        height_px: int,
-        horizontal_fov_deg: float,
-        *,
-        height_m: float = 1.57,
-        depression_deg: float = 23.0,
-        azimuth_deg: float = 0.0,
-        roll_deg: float = 0.0,
-        forward_m: float = 0.0,
-        left_m: float = 0.0,
-        readout_s: float = 0.0,
-    ) -> Camera:
+    def from_field_of_view(cls, width_px: int, height_px: int, horizontal_fov_deg: float, **mount: float) -> Camera:
         """Camera with square pixels and a centred principal point from its horizontal field of view. [deg]"""
         if not 1 <= horizontal_fov_deg < 179:
             raise InvalidParameter(
@@ -74,10 +63,7 @@ class Camera:
                 limit="1 to 179 deg",
             )
         focal_px = width_px / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
-        return cls(
-            width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, (),
-            height_m, depression_deg, azimuth_deg, roll_deg, forward_m, left_m, readout_s,
-        )  # fmt: skip
+        return cls(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, (), **mount)
 
     @property
     def matrix(self) -> npt.NDArray[np.float64]:
@@ -102,6 +88,94 @@ class Camera:
         return np.array([self.forward_m, self.left_m, self.height_m])
 
 
+# === A camera as a vehicle declares it.
+
+
+INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
+_PROJECTION = {"width_px", "height_px", *INTRINSICS, "distortion", "horizontal_fov_deg", "calibration_id"}
+
+
+class CameraDeclaration(Declaration):
+    """Intrinsics of the frames or their horizontal field of view, and the mount on the vehicle."""
+
+    width_px: Whole | None = Field(None, ge=1, description="Width of the upright frames. [px]")
+    height_px: Whole | None = Field(None, ge=1, description="Height of the upright frames. [px]")
+    fx_px: Number | None = Field(None, description="Focal length in x. [px]")
+    fy_px: Number | None = Field(None, description="Focal length in y. [px]")
+    cx_px: Number | None = Field(None, description="Principal point, pixel centres at integers. [px]")
+    cy_px: Number | None = Field(None, description="Principal point, pixel centres at integers. [px]")
+    distortion: tuple[Number, ...] = Field((), max_length=8, description="OpenCV k1 k2 p1 p2 [k3 ...].")
+    horizontal_fov_deg: Number | None = Field(None, description="Horizontal field of view. [deg]")
+    height_m: Number = Field(1.57, le=100, description="Above the road. [m]")
+    depression_deg: Number = Field(23.0, ge=-90, le=90, description="Optical axis below the horizontal. [deg]")
+    azimuth_deg: Number = Field(0.0, ge=-180, le=360, description="Optical axis right of straight ahead. [deg]")
+    roll_deg: Number = Field(0.0, ge=-180, le=180, description="Clockwise about the optical axis. [deg]")
+    forward_m: Number = Field(0.0, ge=-100, le=100, description="Ahead of the vehicle's reference point. [m]")
+    left_m: Number = Field(0.0, ge=-100, le=100, description="Left of the vehicle's reference point. [m]")
+    readout_s: Number = Field(
+        0.0, ge=0, le=1, description="Rolling shutter: from the first row's exposure to the last's. [s]"
+    )
+
+    @property
+    def has_projection(self) -> bool:
+        """Whether it states its projection, completely or in part."""
+        return any(getattr(self, name) is not None for name in (*INTRINSICS, "horizontal_fov_deg"))
+
+    def check(self) -> None:
+        """Refuse a camera that is incomplete or contradicts itself, after a vehicle's profile completed it.
+
+        Raises
+        ------
+        InvalidParameter
+            The field is below ``camera``.
+        """
+        intrinsics = [name for name in INTRINSICS if getattr(self, name) is not None]
+        if bool(intrinsics) == (self.horizontal_fov_deg is not None) or len(intrinsics) not in (0, 4):
+            raise InvalidParameter(
+                "a camera has four intrinsics or a horizontal field of view",
+                field="camera.horizontal_fov_deg" if not intrinsics else "camera.fx_px",
+                limit="fx_px, fy_px, cx_px, cy_px; or horizontal_fov_deg",
+                cure="send all four intrinsics with width_px and height_px, or horizontal_fov_deg alone",
+            )
+        if intrinsics and (self.width_px is None or self.height_px is None):
+            raise InvalidParameter(
+                "intrinsics belong to one size of frame",
+                field="camera.width_px",
+                limit="width_px and height_px beside intrinsics",
+                cure="send the size of the frames that the camera was calibrated with",
+            )
+        if self.distortion and not intrinsics:
+            raise InvalidParameter(
+                "distortion needs the four intrinsics", field="camera.distortion", limit="with intrinsics only"
+            )
+        self.camera_of(self.width_px or 1920, self.height_px or 1080)
+
+    def camera_of(self, width_px: int, height_px: int) -> Camera:
+        """The camera of upright frames of a size.
+
+        Raises
+        ------
+        InvalidParameter
+            The frames have another size than the camera.
+        """
+        for name, declared, actual in (
+            ("width_px", self.width_px, width_px),
+            ("height_px", self.height_px, height_px),
+        ):
+            if declared is not None and declared != actual:
+                raise InvalidParameter(
+                    f"the camera's {name} is {declared}, the frame's is {actual} (upright)",
+                    field=f"camera.{name}",
+                    limit=f"{width_px} x {height_px} px",
+                    cure="send the camera parameters of these frames, or the frames as the camera wrote them",
+                )
+        mount = self.model_dump(exclude=_PROJECTION)
+        if self.horizontal_fov_deg is not None:
+            return Camera.from_field_of_view(width_px, height_px, self.horizontal_fov_deg, **mount)
+        fx, fy, cx, cy = (float(getattr(self, name)) for name in INTRINSICS)
+        return Camera(width_px, height_px, fx, fy, cx, cy, self.distortion, **mount)
+
+
 # === The board that cameras are calibrated with: a chessboard whose white squares hold ArUco markers (ChArUco).
 
 
@@ -118,9 +192,12 @@ MAX_SIDE_MM = 3000.0
 _MARKERS = 100
 
 
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, slots=True)
 class CalibrationBoard:
-    """A board, seen from the front. Board frame: millimetres from its upper left corner, x right, y down.
+    """A board: squares across and down, the upper left one black, and their sides as measured on the print.
+
+    Board frame: millimetres from its upper left corner, x right, y down. Intrinsics do not depend on the scale.
 
     Raises
     ------
@@ -128,14 +205,10 @@ class CalibrationBoard:
         A figure is out of its limits.
     """
 
-    # `columns`, `rows`: squares, 4 to 24 each, at most 200 together: half of them hold a marker. The upper left one is
-    # black.
-    columns: int = 7
-    rows: int = 10
-    # `square_mm`, `marker_mm`: [mm] side of a square, 8 to 250 mm, and of a marker, 0.5 to 0.85 of that. As measured on
-    # the print; intrinsics do not depend on the scale.
-    square_mm: float = 25.0
-    marker_mm: float = 18.0
+    columns: Annotated[Whole, Field(description="Squares across, 4 to 24.")] = 7
+    rows: Annotated[Whole, Field(description="Squares down, 4 to 24; at most 200 squares.")] = 10
+    square_mm: Annotated[Number, Field(description="Side of a square, 8 to 250. [mm]")] = 25.0
+    marker_mm: Annotated[Number, Field(description="Side of a marker, 0.5 to 0.85 of a square. [mm]")] = 18.0
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows"):

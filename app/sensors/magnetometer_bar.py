@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, model_validator
 
 from app.errors import InvalidParameter
+from app.inputs import Declaration, Number
 
 Floats = npt.NDArray[np.float64]
 
@@ -81,7 +84,11 @@ class MagnetometerBar:
         turns = np.array(self.vehicle_from_sensor, float)
         if not turns.size:
             turns = np.tile(np.eye(3), (len(roles), 1, 1))
-        if turns.shape != (len(roles), 3, 3) or not np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6):
+        if (
+            turns.shape != (len(roles), 3, 3)
+            or not np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6)
+            or not np.allclose(np.linalg.det(turns), 1, atol=1e-6)
+        ):
             raise InvalidParameter(
                 "each sensor has a rotation matrix", field="bar.vehicle_from_sensor", limit="S rotations, 3 x 3"
             )
@@ -139,6 +146,59 @@ class MagnetometerBar:
     def references(self) -> npt.NDArray[np.intp]:
         """Indices of the reference sensors."""
         return np.array([i for i, role in enumerate(self.roles) if role is SensorRole.REFERENCE], np.intp)
+
+
+# === What is declared of a bar.
+
+
+Triple = tuple[Number, Number, Number]
+
+
+class SensorDeclaration(Declaration):
+    """One magnetometer of the bar."""
+
+    position_m: Triple = Field(description="Forward, left, up in the vehicle (ISO 8855). [m]")
+    role: SensorRole = SensorRole.ARRAY
+    vehicle_from_sensor: tuple[Triple, Triple, Triple] | None = Field(
+        None, description="Rotation of the chip; with it `axes` is not needed."
+    )
+
+
+class BarDeclaration(Declaration):
+    """The bar of magnetometers; METRO's twelve and two where no sensors are declared."""
+
+    forward_m: Number = Field(0.0, ge=-20, le=20, description="Ahead of the point that moves along the heading. [m]")
+    clearance_m: Number | None = Field(
+        None,
+        ge=MIN_CLEARANCE_M,
+        le=MAX_CLEARANCE_M,
+        description="Height of the array sensors above the road; left out, three magnets or more show it. [m]",
+    )
+    sensors: tuple[SensorDeclaration, ...] | None = Field(None, min_length=3, max_length=MAX_SENSORS)
+
+    @model_validator(mode="after")
+    def _is_a_bar(self) -> BarDeclaration:
+        assert self.magnetometers.sensor_count
+        return self
+
+    @cached_property
+    def magnetometers(self) -> MagnetometerBar:
+        """The bar."""
+        if not self.sensors:
+            return MagnetometerBar.metro(forward_m=self.forward_m, clearance_m=self.clearance_m)
+        positions = np.array([sensor.position_m for sensor in self.sensors])
+        positions[:, 0] += self.forward_m
+        turns = [sensor.vehicle_from_sensor or np.eye(3) for sensor in self.sensors]
+        roles = tuple(sensor.role for sensor in self.sensors)
+        return MagnetometerBar(positions, roles, np.array(turns, float), clearance_m=self.clearance_m)
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the rotation of a sensor is declared."""
+        return any(sensor.vehicle_from_sensor for sensor in self.sensors or ())
+
+
+# === The trace that a bar records.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

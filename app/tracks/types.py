@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from app.errors import InvalidParameter
+from app.inputs import Declaration, Number
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -138,27 +140,26 @@ class TrackInput:
     paths: tuple[LanePath, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class TrackRules:
+class TrackRules(Declaration):
     """How a track is estimated."""
 
-    rate_hz: float = 2.0  # [Hz] of the positions that are returned
-    max_sigma_m: float = 2.0  # [m] where the larger standard deviation of a position exceeds this, the track has a gap
-    outlier_probability: float = 1e-3  # share of good markers that the gate leaves out
-    speed_scale_sigma: float = 0.03  # scale error of the speed to be expected
-    heading_bias_sigma_deg: float = 3.0  # [deg] bias of the heading to be expected
-    # `wander_m`, `wander_length_m`: [m] how far from the middle of its lane a vehicle drives, and over which length
-    # that changes
-    wander_m: float = 0.4
-    wander_length_m: float = 100.0
-
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            value, (low, high) = getattr(self, entry.name), _LIMITS[entry.name]
-            if not low <= value <= high:
-                raise InvalidParameter(
-                    f"{entry.name} is {value:g}", field=f"options.{entry.name}", limit=f"{low:g} to {high:g}"
-                )
+    rate_hz: Number = Field(2.0, ge=0.1, le=10, description="Of the positions. [Hz]")
+    max_sigma_m: Number = Field(
+        2.0, ge=0.05, le=100, description="Where a standard deviation is larger, the track has a gap. [m]"
+    )
+    outlier_probability: Number = Field(
+        1e-3, ge=1e-9, le=0.1, description="Share of good markers that the gate may leave out."
+    )
+    speed_scale_sigma: Number = Field(
+        0.03, ge=1e-4, le=0.2, description="Scale error of the vehicle's speed to be expected."
+    )
+    heading_bias_sigma_deg: Number = Field(
+        3.0, ge=0.01, le=30, description="Bias of the vehicle's heading to be expected. [deg]"
+    )
+    wander_m: Number = Field(
+        0.4, ge=0.05, le=5, description="How far from the middle of its lane the vehicle drives. [m]"
+    )
+    wander_length_m: Number = Field(100.0, ge=1, le=10_000, description="Length over which that changes. [m]")
 
 
 MAX_CLOCK_SIGMA_S = 10.0
@@ -166,15 +167,6 @@ MAX_CLOCK_SIGMA_S = 10.0
 at 50 km/h, about the distance between two markers."""
 MAX_LAT_DEG = 89.9
 """Northernmost latitude. [deg] 11 km from the pole a heading changes by 0.1 deg in 20 m."""
-_LIMITS = {
-    "rate_hz": (0.1, 10.0),
-    "max_sigma_m": (0.05, 100.0),
-    "outlier_probability": (1e-9, 0.1),
-    "speed_scale_sigma": (1e-4, 0.2),
-    "heading_bias_sigma_deg": (0.01, 30.0),
-    "wander_m": (0.05, 5.0),
-    "wander_length_m": (1.0, 10_000.0),
-}
 
 
 @dataclass(frozen=True, slots=True)

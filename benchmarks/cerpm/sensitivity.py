@@ -14,7 +14,7 @@ import argparse
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from unittest.mock import patch
 
 import numpy as np
@@ -111,7 +111,7 @@ def scaled(name: str, factor: float) -> Iterator[tuple[LaneRules, float]]:
     module, *_, constant = name.split(".")
     if ".LaneRules." in name:
         value = getattr(LaneRules(), constant)
-        yield replace(LaneRules(), **{constant: factor * value}), value
+        yield LaneRules(**{constant: factor * value}), value
     elif ".Hyperparameters." in name:
         value = getattr(Hyperparameters(), constant)
 

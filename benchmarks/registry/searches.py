@@ -19,7 +19,7 @@ from app.registry.features import FeatureFilter
 from app.registry.markers import MarkerFilter
 from app.registry.spatial import Area, Box
 from app.services.access.access import Access, Caller
-from app.services.decodes.context import CoarsePosition
+from app.services.decodes.declarations import CoarsePosition
 from app.services.decodes.matching import find_nearby_markers, match_reading
 from app.services.markers.features import MARKERS, Features
 from app.services.markers.searches import Searches
@@ -134,7 +134,7 @@ def _searches(database: Database, caller: Caller, network: Network) -> dict[str,
         k = min(k, len(network.lon_deg) - 1)
         lon, lat = float(network.lon_deg[k]), float(network.lat_deg[k])
         reading = PlateReading(PlateOutcome.READ, code=PlateCode.from_position(lon, lat), confidence=1.0)
-        position = CoarsePosition(lon + 5e-5, lat - 5e-5, COARSE_M)
+        position = CoarsePosition(lon_deg=lon + 5e-5, lat_deg=lat - 5e-5, accuracy_m=COARSE_M)
         with database.read() as connection:
             nearby = find_nearby_markers(connection, caller.agency_id, position)
             return _found(match_reading(connection, caller.agency_id, reading, position, nearby))

@@ -14,11 +14,12 @@ import pytest
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.bags import messages as bag_messages
 from app.formats.format import SpooledFile
-from app.formats.traces.declaration import AxisConvention, TraceDeclaration
+from app.formats.traces.declaration import TraceDeclaration
 from app.formats.traces.read import read_trace
 from app.formats.video import index_video, read_frames
 from app.formats.video_file import ReadReport, VideoFile, VideoIndex, VideoKind, detect_video
 from tests.formats.pictures import jpeg
+from tests.formats.traces.recordings import bar_of
 from tests.machine import require_module
 
 mcap_writer = require_module("mcap.writer", "the extra bags")
@@ -270,7 +271,7 @@ def test_raw_pictures(tmp_path: Path) -> None:
 def test_magnetometers_are_a_trace(tmp_path: Path) -> None:
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     data = sqlite_bag(tmp_path / "a.db3", bag_fields(store, 3, 600))
-    declared = TraceDeclaration(sensors=3, axes=AxisConvention.ISO8855, references=())
+    declared = TraceDeclaration(bar=bar_of(3), axes="ISO8855")
     with (tmp_path / "a.db3").open("rb") as stream:
         traces = [read_trace({"drive.db3": given}, declared).trace for given in (data, stream)]
     for trace in traces:
@@ -281,7 +282,7 @@ def test_magnetometers_are_a_trace(tmp_path: Path) -> None:
         assert trace.field_ut[5, :, 2] == pytest.approx([-40.0] * 3, abs=1e-3)
         assert trace.speed_m_s == pytest.approx(np.full(len(trace.speed_m_s), 12.0))
     with pytest.raises(InvalidParameter, match="3 topics of magnetic fields, and 14 sensors") as refused:
-        read_trace({"drive.db3": data}, TraceDeclaration(axes=AxisConvention.ISO8855))
+        read_trace({"drive.db3": data}, TraceDeclaration(axes="ISO8855"))
     assert "/mag_8 (sensor_msgs/msg/MagneticField)" in refused.value.message
     with pytest.raises(InvalidParameter, match="the bag has no pictures") as refused:
         _indexed(data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy
+from pydantic import ValidationError
 
 from app.errors import InvalidParameter
 from app.lanes.estimate import LaneMarkers, LaneRules, LeftOutReason, fit_lane, preview_m
@@ -225,9 +226,9 @@ def test_what_is_refused_as_a_call():
         LaneMarkers(
             markers.number, markers.lon_deg, markers.lat_deg, markers.side + 5, markers.sigma_m, markers.sigma_m
         )
-    with pytest.raises(InvalidParameter):
+    with pytest.raises(ValidationError):
         LaneRules(usual_width_m=float("nan"))
-    with pytest.raises(InvalidParameter):
+    with pytest.raises(ValidationError):
         LaneRules(bridge_m=-1.0)
 
 

@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 from fastapi import Path, Query, Request, Response
 
-from app.api.decodes.schemas import CONTEXT_EXAMPLE, ContextIn
 from app.api.decodes.uploads import RAW_TYPES, Upload
 from app.api.http.bodies import form_body
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
@@ -27,6 +26,7 @@ from app.api.http.routes import Router
 from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
+from app.services.decodes.declarations import CONTEXT_EXAMPLE, UploadContext
 from app.services.decodes.decodes import DecodeDetails, PacketsDocument
 from app.services.decodes.decodes import Decodes as DecodesService
 from app.services.decodes.documents import DecodeDocument, DecodePage
@@ -45,7 +45,7 @@ _BODY = form_body(
         "vehicle": {"type": "string", "description": "Name or id of the vehicle."},
     },
     "context",
-    ContextIn,
+    UploadContext,
     {"file": "frame.jpg", "context": CONTEXT_EXAMPLE},
     **{kind: {"schema": _JSON_BODY if kind == "application/json" else BINARY} for kind in RAW_TYPES},
 )
@@ -78,7 +78,9 @@ def post_decode(caller: Caller, upload: Upload, decodes: Decodes) -> Response:
     The context comes as the form's part `context`, or beside a bare file in the header `Waymark-Context`, as JSON. With
     an Idempotency-Key a repeated request gets the first answer again. No plate is a result: an empty list.
     """
-    document, replayed = decodes.decode_upload(caller, upload.file, upload.context, upload.idempotency)
+    document, replayed = decodes.decode_upload(
+        caller, upload.file, upload.context, upload.idempotency, name=upload.name
+    )
     if document["state"] == "done":
         return created_response(document, replayed, path="/v1/decodes")
     response = created_response(document, replayed, path="/v1/decodes", status=202)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 from anyio import to_thread
@@ -12,7 +12,6 @@ from fastapi import Depends, Header, Request
 from pydantic import TypeAdapter
 from starlette.datastructures import UploadFile
 
-from app.api.decodes.schemas import ContextIn
 from app.api.http.bodies import (
     FORM,
     SpooledPart,
@@ -30,7 +29,7 @@ from app.api.http.responses import IdempotencyKeyHeader
 from app.api.http.strict_json import validated
 from app.errors import MalformedRequest, QuotaExceeded, UnreadableUpload, UnsupportedUpload
 from app.formats.format import SpooledFile
-from app.services.decodes.context import ContextInput
+from app.services.decodes.declarations import UploadContext
 from app.services.idempotency import IdempotencyKey
 from app.services.uploads.quotas import Quotas
 
@@ -48,7 +47,8 @@ class UploadedFile:
     """A file with its context, and the client's Idempotency-Key if it sent one."""
 
     file: SpooledFile
-    context: ContextInput
+    name: str  # of the file; empty where it has none
+    context: UploadContext
     idempotency: IdempotencyKey | None
 
 
@@ -74,11 +74,11 @@ async def get_upload(
     """
     await check_quota(request)
     async with _received(request, context_header) as (file, text, name, vehicle):
-        context = await context_of(text, name)
+        context = await context_of(text)
         if vehicle:
             context = with_vehicle(context, vehicle)
             text += b"\n" + vehicle.encode()
-        yield UploadedFile(file, context, idempotency_of(request, idempotency_key, text, file))
+        yield UploadedFile(file, name, context, idempotency_of(request, idempotency_key, text, file))
 
 
 async def check_quota(request: Request) -> None:
@@ -94,7 +94,7 @@ async def check_quota(request: Request) -> None:
         raise BodyRefused(error) from error
 
 
-async def context_of(text: bytes, file_name: str) -> ContextInput:
+async def context_of(text: bytes) -> UploadContext:
     """The context of an upload from its JSON.
 
     Raises
@@ -104,7 +104,7 @@ async def context_of(text: bytes, file_name: str) -> ContextInput:
     """
     if len(text) > MAX_CONTEXT_BYTES:
         raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
-    return (await read_declaration(ContextIn, text, "context")).context_input(file_name)
+    return await read_declaration(UploadContext, text, "context")
 
 
 @asynccontextmanager
@@ -127,9 +127,9 @@ async def _received(request: Request, context_header: str | None) -> AsyncIterat
         )
 
 
-def with_vehicle(context: ContextInput, vehicle: str) -> ContextInput:
+def with_vehicle(context: UploadContext, vehicle: str) -> UploadContext:
     """The context with the vehicle that the form's part names."""
-    named = validated(TypeAdapter(ContextIn), {"vehicle": vehicle}, "form").vehicle
+    named = validated(TypeAdapter(UploadContext), {"vehicle": vehicle}, "form").vehicle
     if context.vehicle not in (None, named):
         raise MalformedRequest(
             "the form and the context name different vehicles",
@@ -137,7 +137,7 @@ def with_vehicle(context: ContextInput, vehicle: str) -> ContextInput:
             limit="one vehicle",
             cure="name it once",
         )
-    return replace(context, vehicle=named)
+    return context.model_copy(update={"vehicle": named})
 
 
 @asynccontextmanager

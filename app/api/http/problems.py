@@ -18,6 +18,7 @@ from app import errors
 from app.api.http.permissions import CHALLENGES
 from app.api.public_pages.html import as_page
 from app.encoders.magnet import CodebookFull
+from app.inputs import input_error
 from app.services.documents import ErrorCause, cut_text, error_cause
 
 # === Schemas of the OpenAPI document that FastAPI does not find by itself: parts of forms, and problem documents.
@@ -314,35 +315,11 @@ def _http_detail(request: Request, error: HTTPException) -> str:
     return str(error.detail)
 
 
-_CONSTRAINTS = {
-    "ge": "at least {}",
-    "gt": "more than {}",
-    "le": "at most {}",
-    "lt": "less than {}",
-    "min_length": "at least {} long",
-    "max_length": "at most {} long",
-    "pattern": "pattern {}",
-    "expected": "one of {}",
-}
-
-
 def validation_fault(item: Mapping[str, Any]) -> FieldError:
     """The invalid input that an error of pydantic names."""
     location = [str(part) for part in item["loc"] if not str(part).startswith(UNION_TAG)]
-    path = ".".join(location[1:] if len(location) > 1 else location)
-    context = item.get("ctx") or {}
-    limits = [text.format(context[name]) for name, text in _CONSTRAINTS.items() if name in context]
-    cause = context.get("error")
-    if isinstance(cause, errors.WaymarkError):
-        return FieldError(field=cause.field or path, detail=cause.message, limit=cause.limit, cure=cause.cure)
-    near = f"did you mean {context['near']}? If not, " if "near" in context else ""
-    cures = {"missing": f"send {path}", "extra_forbidden": f"{near}leave {path} out"}
-    return FieldError(
-        field=path,
-        detail=f"{path}: {item['msg']}",
-        limit=", ".join(limits) or item["msg"],
-        cure=cures.get(item["type"], f"correct {path}; /docs describes what it may be"),
-    )
+    error = input_error(item, location[1:], location[0])
+    return FieldError(error.field, error.message, error.limit, error.cure)
 
 
 def _protocol(scope: Scope) -> dict[str, str]:

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 
 import orjson
 from fastapi import Header, Request, Response
-from pydantic import AfterValidator, AwareDatetime
 
 from app.api.http.problems import Described, problem_responses
 from app.errors import InvalidParameter
+from app.inputs import Time as Time
 
 BINARY: dict[str, str] = {"type": "string", "format": "binary"}
 GEOJSON: dict[str, Any] = {
@@ -173,10 +173,6 @@ def _no_cursor() -> InvalidParameter:
 # === Times in addresses, queries and bodies.
 
 
-MIN_YEAR, MAX_YEAR = 1900, 2200
-"""Years of times in requests, so that no offset and no length of a recording leads out of the calendar of Python and
-PostgreSQL."""
-
 _RFC3339 = re.compile(
     r"[0-9]{4}-[0-9]{2}-[0-9]{2}[Tt ][0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,6})?([Zz]|[+-][0-9]{2}:[0-9]{2})"
 )
@@ -201,17 +197,3 @@ def parse_time(text: str, field: str) -> datetime:
         limit="RFC 3339 with a zone and at most six decimals, years 1 to 9999",
         cure="write 2026-03-04T05:06:07Z; a + in an address is written %2B",
     )
-
-
-def _check_year(time: datetime) -> datetime:
-    if not MIN_YEAR <= time.year < MAX_YEAR:
-        raise InvalidParameter(
-            "the time is too far away",
-            limit=f"years {MIN_YEAR} to {MAX_YEAR - 1}",
-            cure="send an RFC 3339 time with its offset, e.g. 2026-03-04T05:06:07Z",
-        )
-    return time
-
-
-Time = Annotated[AwareDatetime, AfterValidator(_check_year)]
-"""A time with its zone in a query or a body."""

@@ -529,7 +529,7 @@ def match_known_markers(
     """
     numbers = list_numbers(packets)
     intervals_s = [known.min_interval_s[n] / 2 for n in numbers if n in known.min_interval_s]
-    freshness = replace(freshness or FreshnessRules(), min_interval_s=min(intervals_s, default=None))
+    freshness = (freshness or FreshnessRules()).model_copy(update={"min_interval_s": min(intervals_s, default=None)})
     verification = verify_packets(packets, keys, known.earlier_spans, freshness, max_invalid_tags=max_invalid_tags)
     merged = merge_markers(verification.packets, known.registered, track, rules)
     return verification, _without_retired(merged, known.retired)

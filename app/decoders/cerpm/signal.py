@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, model_validator
 
 from app.decoders.cerpm.merge import distances_m, vehicle_positions
 from app.decoders.cerpm.verify import VerifiedPacket
 from app.errors import InvalidParameter
+from app.inputs import Declaration, Number
 from app.radio.link import (
     EXPONENT,
     NEAR_DBM,
@@ -58,9 +60,17 @@ class SignalHealth(StrEnum):
     NOT_ENOUGH_DATA = "not-enough-data"
 
 
-@dataclass(frozen=True, slots=True)
-class SignalRules:
-    """Limits of weak and failing radios."""
+class ReceiverDeclaration(Declaration):
+    """The vehicle's radio receiver."""
+
+    sensitivity_dbm: Number | None = Field(None, ge=-160, le=-40, description="Fitted if left out. [dBm]")
+    antenna_height_m: Number | None = Field(
+        None, gt=0, le=20, description=f"Above the road, {ANTENNA_M:g} if left out. [m]"
+    )
+
+
+class SignalRules(ReceiverDeclaration):
+    """Limits of weak and failing radios, and the receiver."""
 
     # `weak_db`, `failing_db`: [dB] level below the line, negative. The 95 % interval must be below half of it.
     weak_db: float = -6.0  # [dB] source: half the range at the paper's exponent of 2.04
@@ -68,22 +78,14 @@ class SignalRules:
     # `weak_share`, `failing_share`: delivery ratio over that of the fleet; the whole 95 % interval must be below
     weak_share: float = 0.5
     failing_share: float = 0.25
-    sensitivity_dbm: float | None = None  # [dBm] of the receiver; fitted if None
-    antenna_height_m: float = ANTENNA_M  # [m] of the receiver above the road
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _failing_is_below_weak(self) -> SignalRules:
         if not self.failing_db < self.weak_db < 0:
-            raise InvalidParameter(
-                "levels are negative, failing below weak", field="signal.weak_db", limit="below 0 dB"
-            )
+            raise InvalidParameter("levels are negative, failing below weak", field="weak_db", limit="below 0 dB")
         if not 0 < self.failing_share < self.weak_share <= 1:
-            raise InvalidParameter("shares lie between 0 and 1", field="signal.weak_share", limit="0 to 1")
-        if not 0 < self.antenna_height_m <= 20:
-            raise InvalidParameter(
-                f"the antenna is {self.antenna_height_m:g} m above the road",
-                field="receiver.antenna_height_m",
-                limit="above 0, at most 20 m",
-            )
+            raise InvalidParameter("shares lie between 0 and 1", field="weak_share", limit="0 to 1")
+        return self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +161,7 @@ def profile_signals(
     reason to check the marker, not to replace it.
     """
     rules = rules or SignalRules()
-    antenna_m = rules.antenna_height_m
+    antenna_m = rules.antenna_height_m or ANTENNA_M
     markers = _group_packets(verified, places, track, antenna_m)
     line = _fleet_line(markers, rules)
     fleet = line is not None and sum(one.measured.sum() >= MIN_LEVELS for one in markers) >= MIN_FLEET

@@ -9,12 +9,14 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from app.errors import InvalidParameter
+from app.inputs import Declaration
 from app.markers.cerpm import (
     BODY_BYTES,
     KEY_BYTES,
@@ -173,32 +175,25 @@ class SequenceSpan:
     last_heard_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class FreshnessRules:
-    """Tolerances when times and sequences are compared.
+Tolerance = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
-    Raises
-    ------
-    InvalidParameter
-        A value is negative or not finite.
-    """
 
-    # [s] maximum difference between the clocks of two drives
-    clock_tolerance_s: float = 60.0  # [s]
-    # [s] maximum by which times within one log are out of order
-    log_tolerance_s: float = 3.0  # [s]
-    # [s] the same sequence again within this time is an echo (another gateway, a repeated delivery), later a replay
-    echo_s: float = 3.0  # [s] source: `log_tolerance_s`
+class FreshnessDeclaration(Declaration):
+    """How strictly times and sequences are compared."""
+
+    clock_tolerance_s: Tolerance = Field(60.0, description="Largest difference between the clocks of two drives. [s]")
+    log_tolerance_s: Tolerance = Field(3.0, description="Largest step back of the times within a log. [s]")
+    # echoes come from another gateway, or are delivered again; source of the default: `log_tolerance_s`
+    echo_s: Tolerance = Field(3.0, description="The same packet is an echo up to this time, later a replay. [s]")
+
+
+class FreshnessRules(FreshnessDeclaration):
+    """Tolerances when times and sequences are compared, with what is known of the log."""
+
     # [s] shortest time from one transmission of a marker to the next, if known. Without it, half of the interval found
     # in the log is used within the log, and the time on air at the fastest setting between logs.
-    min_interval_s: float | None = None
-    uploaded_at_s: float | None = None  # [s] when the log was uploaded: no packet can have been received later
-
-    def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value >= 0):
-                raise InvalidParameter(f"{name} is {value}", field=f"freshness.{name}", limit="0 or more, finite [s]")
+    min_interval_s: Tolerance | None = None
+    uploaded_at_s: Tolerance | None = None  # [s] when the log was uploaded: no packet can have been received later
 
 
 class SequenceOrder:

@@ -11,15 +11,17 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict, Field, with_config
 from pyproj import Geod
 
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding, PlacedMagnet, TagReading
 from app.errors import InvalidParameter
 from app.geodesy import LocalizationGrade, enu_from_wgs84, wgs84_from_enu
+from app.inputs import Number, Whole
 from app.markers.magnet import InformationTag, Polarity, check_magnet_count, segments_in
 from app.markers.magnet_design import Meaning
 from app.sensors.magnetometer_bar import MagnetometerBar
@@ -67,14 +69,14 @@ _MIN_GRID_STD = 0.05  # [segments] smallest standard error of a place on the gri
 _MISSING_PROBABILITY = 0.5  # of a format with missing magnets, whose code is unknown
 
 
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, slots=True)
 class TagFormat:
     """Tags of M magnets over L metres on a grid of Seg_d, whatever their code."""
 
-    magnets: int = 3  # m
-    # `length_m`, `segment_m`: [m] L and Seg_d
-    length_m: float = 4.0
-    segment_m: float = 1.0
+    magnets: Annotated[Whole, Field(ge=2, le=7, description="M.")] = 3
+    length_m: Annotated[Number, Field(description="L. [m]")] = 4.0
+    segment_m: Annotated[Number, Field(description="Seg_d. [m]")] = 1.0
 
     def __post_init__(self) -> None:
         check_magnet_count(self.magnets)

@@ -279,7 +279,11 @@ def _from_chirpstack(entry: int, record: Mapping[str, object], clock: LogClock) 
 
 def _gps_time(value: object, clock: LogClock) -> float:
     found = _DURATION.match(value) if isinstance(value, str) else None
-    return LogClock(TimeScale.UNIX_S, clock.offset_s).read(utc_from_gps_s(float(found[1]))) if found else math.nan
+    return (
+        LogClock(scale=TimeScale.UNIX_S, offset_s=clock.offset_s).read(utc_from_gps_s(float(found[1])))
+        if found
+        else math.nan
+    )
 
 
 # --- The Things Stack v3 ------------------------------------------------------------------------------------------
@@ -381,9 +385,9 @@ def _packet_from_record(
     kind = find_kind(event)
     if kind is not None:
         source.report.format = str(kind)
-        return packet_from_uplink(entry, kind, event, declaration.clock)
+        return packet_from_uplink(entry, kind, event, declaration.times)
     names = tuple(event)[:256]
-    places = match_columns(names, ALIASES, declaration.columns) if names not in shapes else shapes[names]
+    places = match_columns(names, ALIASES, declaration.columns or {}) if names not in shapes else shapes[names]
     if len(shapes) < _MAX_SHAPES:
         shapes[names] = places
     if "payload" not in places and not all(quantity in places for quantity in NEEDED):
@@ -393,7 +397,7 @@ def _packet_from_record(
     values = {quantity: event[names[place]] for quantity, place in places.items()}
     values.setdefault("time", outer_time)
     written = payload_text(names[places["payload"]] if "payload" in places else "", declaration)
-    return packet_from_values(entry, values, declaration.clock, written)
+    return packet_from_values(entry, values, declaration.times, written)
 
 
 def looks_like_json_dump(text: str) -> bool:

@@ -104,7 +104,7 @@ PACKET_FORMATS: tuple[Format[PacketReader], ...] = (
         Use.PACKETS,
         "payloads as lines of hex",
         _detect_hex_lines,
-        lambda source: read_hex_lines(source.sample.text, source.declaration.clock, source.report),
+        lambda source: read_hex_lines(source.sample.text, source.declaration.times, source.report),
     ),
     Format(
         PacketFormat.RAW,
@@ -169,7 +169,7 @@ def read_packets(
             limit=f"{limits.file_bytes} bytes",
             cure="cut the log into several",
         )
-    source = PacketSource(Sample(name, data, declaration.columns), declaration, limits, LogReport())
+    source = PacketSource(Sample(name, data, declaration.columns or {}), declaration, limits, LogReport())
     packets = list(islice(_read_any(source), limits.packets + 1))
     if len(packets) > limits.packets:
         raise UploadTooLarge(

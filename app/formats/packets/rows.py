@@ -7,15 +7,19 @@ import binascii
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from itertools import islice
+
+from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter
 from app.formats.format import Sample
 from app.formats.logs import LogClock, LogReport, has_zone
 from app.formats.text import MAX_LINE, clean_text, numbered_lines, read_number, repeated_names
 from app.geodesy import check_lon_lat
+from app.inputs import Declaration, Name
 from app.markers.cerpm import (
     HEIGHT_M,
     MAX_NUMBER,
@@ -267,28 +271,26 @@ class PacketFormat(StrEnum):
     HEX = "hex-lines"
 
 
-@dataclass(frozen=True, slots=True)
-class PacketDeclaration:
-    """What the uploader declares of a log; everything is optional.
+class PacketDeclaration(Declaration):
+    """What is declared of a packet log; everything is optional."""
 
-    Raises
-    ------
-    InvalidParameter
-        A quantity is not one of these.
-    """
+    clock: LogClock | None = None
+    columns: dict[Name, Name] | None = Field(
+        None, max_length=16, description="Names of columns: payload, number, lon, lat, rssi, snr, time ..."
+    )
+    payload_text: PayloadText = PayloadText.AUTO
 
-    clock: LogClock = field(default_factory=LogClock)
-    # names of columns in place of the usual ones, by quantity: payload, number, lon, lat, height, rssi, snr, time,
-    # side, speed_kmh, speed_mph, device, event, crs
-    columns: Mapping[str, str] = field(default_factory=dict)
-    payload_text: PayloadText = PayloadText.AUTO  # how the payload column is written; `auto` takes what gives 24 bytes
+    @field_validator("columns")
+    @classmethod
+    def _quantities(cls, columns: dict[str, str] | None) -> dict[str, str] | None:
+        if unknown := sorted(set(columns or ()) - set(ALIASES)):
+            raise InvalidParameter(f"there is no quantity {unknown[0]!r} in a packet log", limit=", ".join(ALIASES))
+        return columns
 
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.columns) - set(ALIASES))
-        if unknown:
-            raise InvalidParameter(
-                f"there is no quantity {unknown[0]!r} in a packet log", field="columns", limit=", ".join(ALIASES)
-            )
+    @cached_property
+    def times(self) -> LogClock:
+        """How its times are read."""
+        return self.clock or LogClock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,12 +324,12 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
         A declared column is missing.
     """
     declaration, report, log = source.declaration, source.report, source.sample.log
-    missing = {q: n for q, n in declaration.columns.items() if n not in log.columns}
+    missing = {q: n for q, n in (declaration.columns or {}).items() if n not in log.columns}
     if missing:
         raise missing_columns(source, missing)
     for repeated in repeated_names(log.columns):
         report.warn(f"{source.sample.name} has several columns named {repeated!r}; the first is read")
-    places = log.places(ALIASES, declaration.columns)
+    places = log.places(ALIASES, declaration.columns or {})
     written = payload_text(log.columns[places["payload"]] if "payload" in places else "", declaration)
     zoned = True
     for entry, cells in enumerate(log.rows()):
@@ -337,10 +339,10 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
                 raise BrokenEntry("malformed", log.bad_row())
             values = {quantity: cells[place] for quantity, place in places.items()}
             zoned = zoned and _names_zone(values.get("time", ""))
-            yield packet_from_values(entry, values, declaration.clock, written, decimal=log.dialect.decimal)
+            yield packet_from_values(entry, values, declaration.times, written, decimal=log.dialect.decimal)
         except BrokenEntry as broken:
             report.leave_out(entry, broken.kind, broken.reason)
-    if not zoned and not declaration.clock.utc_offset_s:
+    if not zoned and not declaration.times.utc_offset_s:
         report.warn("times without a zone were taken as UTC; declare the zone's offset if they are local")
 
 

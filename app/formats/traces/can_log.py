@@ -7,7 +7,7 @@ import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.text import is_clean_text, require_columns
-from app.formats.traces.declaration import ByteOrder, CanDeclaration, CanSignal, TraceLimits, TraceReport
+from app.formats.traces.declaration import CanDeclaration, CanSignal, TraceLimits, TraceReport
 from app.formats.traces.parts import Part, Series
 
 Floats = npt.NDArray[np.float64]
@@ -174,19 +174,20 @@ def _from_dbc(
     """The bits of a named signal, and its decoder if bits alone are not enough (multiplexed, floating point)."""
     message, entry = _find_signal(str(signal.name), _load_signals(dbc, str(signal.name), field), field)
     conversion = entry.conversion
-    placed = replace(
-        signal,
-        name=None,
-        arbitration_id=int(message.frame_id),
-        start_bit=int(entry.start),
-        length=int(entry.length),
-        byte_order=ByteOrder.LITTLE if entry.byte_order == "little_endian" else ByteOrder.BIG,
-        signed=bool(entry.is_signed),
-        factor=float(getattr(conversion, "scale", 1) or 1),
-        offset=float(getattr(conversion, "offset", 0) or 0),
-        unit=signal.unit or entry.unit,
-        minimum=signal.minimum if signal.minimum is not None else _bound(entry, "minimum"),
-        maximum=signal.maximum if signal.maximum is not None else _bound(entry, "maximum"),
+    placed = signal.model_copy(
+        update={
+            "name": None,
+            "arbitration_id": int(message.frame_id),
+            "start_bit": int(entry.start),
+            "length": int(entry.length),
+            "byte_order": "little" if entry.byte_order == "little_endian" else "big",
+            "signed": bool(entry.is_signed),
+            "factor": float(getattr(conversion, "scale", 1) or 1),
+            "offset": float(getattr(conversion, "offset", 0) or 0),
+            "unit": signal.unit or entry.unit,
+            "minimum": signal.minimum if signal.minimum is not None else _bound(entry, "minimum"),
+            "maximum": signal.maximum if signal.maximum is not None else _bound(entry, "maximum"),
+        }
     )
     if not (entry.multiplexer_ids or entry.is_multiplexer or conversion.is_float):
         return placed, None
@@ -287,7 +288,7 @@ def _extract(data: list[bytes], signal: CanSignal) -> Floats:
 def _bit_places(signal: CanSignal) -> tuple[list[tuple[int, int]], int]:
     """Byte and bit of each bit of a signal, most significant first; and the bytes that a frame needs."""
     places = []
-    if signal.byte_order is ByteOrder.LITTLE:
+    if signal.byte_order == "little":
         places = [divmod(signal.start_bit + i, 8) for i in range(signal.length - 1, -1, -1)]
     else:
         byte, bit = divmod(signal.start_bit, 8)
@@ -336,7 +337,7 @@ _MAX_WORK = 3e8  # offsets times windows times circumferences; bounds the time
 def align_speed(
     t: Floats,
     field_ut: npt.NDArray[np.floating],
-    references: tuple[int, ...],
+    references: Sequence[int] | npt.NDArray[np.intp],
     speed: Series | None,
     part: str,
     report: TraceReport,
@@ -347,7 +348,7 @@ def align_speed(
     ----------
     t : ndarray, shape (T,)
     field_ut : ndarray, shape (T, S, 3)
-    references : tuple of int
+    references : sequence of int
         Indices of the sensors near the wheels.
     speed : Series or None
         Over times after the log's first frame.

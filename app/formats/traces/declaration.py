@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
+from typing import Literal
 
-import numpy as np
-import numpy.typing as npt
+from pydantic import Field, model_validator
 
 from app.errors import InvalidParameter
-from app.sensors.magnetometer_bar import MAX_SENSORS, MagnetTrace
-
-Floats = npt.NDArray[np.float64]
+from app.inputs import Declaration, Flag, Name, Number, Whole
+from app.sensors.magnetometer_bar import MAX_SENSORS, BarDeclaration, MagnetometerBar, MagnetTrace
 
 
 class TraceFormat(StrEnum):
@@ -29,210 +28,135 @@ class TraceFormat(StrEnum):
     BAG = "bag"
 
 
-class FieldUnit(StrEnum):
-    """Unit of magnetic flux density."""
-
-    MICROTESLA = "uT"
-    NANOTESLA = "nT"
-    MILLITESLA = "mT"
-    GAUSS = "gauss"
-    MILLIGAUSS = "mG"
-
-
-UT_PER_UNIT = {
-    FieldUnit.MICROTESLA: 1.0,
-    FieldUnit.NANOTESLA: 1e-3,
-    FieldUnit.MILLITESLA: 1e3,
-    FieldUnit.GAUSS: 100.0,
-    FieldUnit.MILLIGAUSS: 0.1,
-}
+FieldUnit = Literal["uT", "nT", "mT", "gauss", "mG"]
+"""Unit of magnetic flux density."""
+UT_PER_UNIT: dict[FieldUnit, float] = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "gauss": 100.0, "mG": 0.1}
+AxisConvention = Literal["ISO8855", "FLU", "FRD"]
+"""Directions of x, y, z as recorded: ISO 8855 is forward, left, up (also called FLU); FRD forward, right, down."""
+SpeedUnit = Literal["m/s", "km/h", "mph", "kn"]
+M_S_PER_UNIT: dict[SpeedUnit, float] = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600}
+AngleUnit = Literal["deg", "rad"]
+TimeUnit = Literal["s", "ms", "us", "ns", "iso"]
+"""Unit of a column of times; `iso` is text in RFC 3339 or without a zone."""
+S_PER_UNIT: dict[TimeUnit, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+ByteOrder = Literal["little", "big"]
+"""Of a CAN signal: Intel or Motorola."""
 
 
-class AxisConvention(StrEnum):
-    """Directions of x, y, z as recorded: ISO 8855 is forward, left, up (also called FLU); FRD forward, right, down."""
+class TraceColumns(Declaration):
+    """Columns of plain CSV and Parquet files."""
 
-    ISO8855 = "ISO8855"
-    FLU = "FLU"
-    FRD = "FRD"
-
-
-class SpeedUnit(StrEnum):
-    """Unit of speed."""
-
-    M_S = "m/s"
-    KM_H = "km/h"
-    MPH = "mph"
-    KNOT = "kn"
-
-
-M_S_PER_UNIT = {SpeedUnit.M_S: 1.0, SpeedUnit.KM_H: 1 / 3.6, SpeedUnit.MPH: 0.44704, SpeedUnit.KNOT: 1852 / 3600}
-
-
-class AngleUnit(StrEnum):
-    """Unit of the heading."""
-
-    DEGREE = "deg"
-    RADIAN = "rad"
-
-
-class TimeUnit(StrEnum):
-    """Unit of a column of times; `ISO` is text in RFC 3339 or without a zone."""
-
-    SECOND = "s"
-    MILLISECOND = "ms"
-    MICROSECOND = "us"
-    NANOSECOND = "ns"
-    ISO = "iso"
-
-
-S_PER_UNIT = {TimeUnit.SECOND: 1.0, TimeUnit.MILLISECOND: 1e-3, TimeUnit.MICROSECOND: 1e-6, TimeUnit.NANOSECOND: 1e-9}
-
-
-class ByteOrder(StrEnum):
-    """Of a CAN signal: Intel or Motorola."""
-
-    LITTLE = "little"
-    BIG = "big"
-
-
-@dataclass(frozen=True, slots=True)
-class TraceColumns:
-    """Names and units of the columns of plain CSV and Parquet files."""
-
-    time: str = "t_s"  # column of times
-    time_unit: TimeUnit = TimeUnit.SECOND
-    # columns x, y, z of each sensor; empty means `s1_x, s1_y, s1_z, s2_x, ...`, as many as there are sensors
-    field: tuple[tuple[str, str, str], ...] = ()
-    # `speed`, `heading`: columns of speed over ground and of heading clockwise from true north, in any of the files
-    speed: str | None = "speed_m_s"
-    speed_unit: SpeedUnit = SpeedUnit.M_S
-    heading: str | None = "heading_deg"
-    heading_unit: AngleUnit = AngleUnit.DEGREE
-    # `delimiter`, `decimal`: of CSV files
-    delimiter: str = ","
-    decimal: str = "."
-
-    def __post_init__(self) -> None:
-        if self.delimiter not in (",", ";", "\t") or self.decimal not in (".", ",") or self.delimiter == self.decimal:
-            raise InvalidParameter(
-                f"delimiter {self.delimiter!r} with decimal {self.decimal!r}",
-                field="columns.delimiter",
-                limit="',', ';' or tab, and '.' or ',' that differ",
-            )
+    time: Name = "t_s"
+    time_unit: TimeUnit = "s"
+    field: tuple[tuple[Name, Name, Name], ...] = Field(
+        (), max_length=MAX_SENSORS, description="x, y, z of each sensor; s1_x, s1_y ... if left out."
+    )
+    speed: Name | None = Field("speed_m_s", description="Speed over ground, in any of the files.")
+    speed_unit: SpeedUnit = "m/s"
+    heading: Name | None = Field("heading_deg", description="Clockwise from true north, in any of the files.")
+    heading_unit: AngleUnit = "deg"
+    delimiter: Literal[",", ";", "\t"] = ","
+    decimal: Literal[".", ","] = "."
 
     def field_names(self, sensors: int) -> tuple[tuple[str, str, str], ...]:
         """Columns of each sensor."""
         return self.field or tuple((f"s{i}_x", f"s{i}_y", f"s{i}_z") for i in range(1, sensors + 1))
 
 
-@dataclass(frozen=True, slots=True)
-class CanSignal:
-    """Where a value is in the frames of a CAN log: by its name in a DBC, or by its bits."""
+class CanSignal(Declaration):
+    """A signal by its name in a DBC, or by identifier, bits and scaling."""
 
-    name: str | None = None  # of the signal in the DBC, `Message.Signal` where the name alone is not unique
-    arbitration_id: int | None = None  # Identifier of the frames
-    # `start_bit`, `length`: [bit] as a DBC counts them: bit 0 is the lowest of byte 0; a big-endian signal starts at
-    # its highest bit
-    start_bit: int = 0
-    length: int = 16
-    byte_order: ByteOrder = ByteOrder.LITTLE
-    signed: bool = False
-    # `factor`, `offset`: value = raw x factor + offset
-    factor: float = 1.0
-    offset: float = 0.0
-    unit: str | None = None  # of the value: a `SpeedUnit` or `AngleUnit`; None takes the DBC's
-    # `minimum`, `maximum`: values outside mean that there is no value; they are left out
-    minimum: float | None = None
-    maximum: float | None = None
+    name: Name | None = Field(None, description="`Message.Signal` where the name alone is not unique.")
+    arbitration_id: Whole | None = Field(None, ge=0, le=0x1FFFFFFF)
+    start_bit: Whole = Field(
+        0,
+        ge=0,
+        le=511,
+        description="As a DBC counts: 0 is the lowest of byte 0; a big-endian signal starts at its highest bit.",
+    )
+    length: Whole = Field(16, ge=1, le=64, description="[bit]")
+    byte_order: ByteOrder = "little"
+    signed: Flag = False
+    factor: Number = Field(1.0, description="Value = raw x factor + offset; not 0.")
+    offset: Number = 0.0
+    unit: Name | None = Field(None, description="Of the speed or heading; that of the DBC if left out.")
+    minimum: Number | None = Field(None, description="Smaller values mean that there is none.")
+    maximum: Number | None = Field(None, description="Larger values mean that there is none.")
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _is_placed(self) -> CanSignal:
         if (self.name is None) == (self.arbitration_id is None):
-            raise InvalidParameter(
-                "a CAN signal has a name in a DBC, or an identifier and bits", field="can.signal", limit="one of both"
-            )
-        if not (1 <= self.length <= 64 and 0 <= self.start_bit < 512):
-            raise InvalidParameter(
-                f"start bit {self.start_bit}, {self.length} bits",
-                field="can.signal.length",
-                limit="1 to 64 bits from bit 0 to 511",
-            )
-        if not np.isfinite((self.factor, self.offset)).all() or self.factor == 0:
-            raise InvalidParameter(
-                "factor and offset are finite, the factor not 0", field="can.signal.factor", limit="finite"
-            )
+            raise InvalidParameter("a CAN signal has a name in a DBC, or an identifier and bits", limit="one of both")
+        if self.factor == 0:
+            raise InvalidParameter("the factor of a CAN signal is 0", field="factor", limit="not 0")
+        return self
 
 
-@dataclass(frozen=True, slots=True)
-class CanDeclaration:
-    """How CAN logs become speed and heading."""
+class CanDeclaration(Declaration):
+    """Speed and heading in CAN logs."""
 
     speed: CanSignal | None = None
     heading: CanSignal | None = None
-    # [s] trace time of the log's first frame. The log's own clock is never believed: only differences of its times are
-    # used. None asks for alignment by the wheels' magnetic noise in the reference sensors.
-    offset_s: float | None = None
-    channel: int | str | None = None  # only frames of this channel
-
-    def __post_init__(self) -> None:
-        if self.offset_s is not None and not np.isfinite(self.offset_s):
-            raise InvalidParameter("the offset is not finite", field="can.offset_s", limit="finite seconds")
+    # The log's own clock is never believed: only differences of its times are used.
+    offset_s: Number | None = Field(
+        None, description="Trace time of the log's first frame; left out, it is found from the wheels' noise. [s]"
+    )
+    channel: Name | Whole | None = Field(None, description="Only frames of this channel.")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TraceDeclaration:
-    """What the uploader declares about the files."""
+class TraceDeclaration(Declaration):
+    """What is declared of the files of a recording. METRO's stream and recorder files need nothing."""
 
-    sensors: int = 14  # number of magnetometers
-    unit: FieldUnit | None = None  # None means microtesla in METRO's formats; CSV and Parquet need it
-    axes: AxisConvention | None = None  # None means FRD in METRO's formats; CSV and Parquet need it, or rotations
-    # shape (S, 3, 3), or None: rotations from the recorded axes of each sensor to ISO 8855, in place of `axes`
-    vehicle_from_sensor: Floats | None = None
-    # shape (S, 3), or None: [uT] calibration: subtracted from the recorded values, in their axes
-    offsets_ut: Floats | None = None
-    calibrated: bool = False  # the offsets are already subtracted: the field has the earth field's magnitude
-    background_removed: bool = False  # the earth's field is subtracted too, so its magnitude cannot confirm the unit
-    references: tuple[int, ...] = (6, 13)  # indices of the reference sensors near the wheels
-    columns: TraceColumns = field(default_factory=TraceColumns)
+    bar: BarDeclaration | None = None
+    unit: FieldUnit | None = Field(None, description="Of CSV and Parquet, and of bags whose fields are not in tesla.")
+    axes: AxisConvention | None = Field(None, description="Of CSV, Parquet and bags.")
+    calibrated: Flag = Field(False, description="Offsets are taken off: the earth's field remains.")
+    background_removed: Flag = Field(False, description="The earth's field is taken off too.")
+    columns: TraceColumns | None = None
     can: CanDeclaration | None = None
-    formats: Mapping[str, TraceFormat] = field(default_factory=dict)  # of files whose content does not show it, by name
-    # [s] added to the times of a file, by its name, to get the trace's
-    clock_offsets_s: Mapping[str, float] = field(default_factory=dict)
-    speed_m_s: float | None = None  # [m/s] constant speed, where no file has one
-    rate_hz: float | None = None  # [Hz] expected sample rate: resolves the phase of a stream where it is ambiguous
-    # [us] added to each interval of a stream: the firmware's intervals leave out the time of the serial write
-    interval_extra_us: float = 0.0
+    formats: dict[Name, Literal["metro-stream", "csv", "parquet", "can-log", "dbc"]] | None = Field(
+        None, max_length=32, description="Of files whose content does not show it, by name."
+    )
+    clock_offsets_s: dict[Name, Number] | None = Field(
+        None, max_length=32, description="Added to the times of a file, by its name. [s]"
+    )
+    speed_m_s: Number | None = Field(None, ge=0.1, le=100, description="Constant speed where no file has one. [m/s]")
+    rate_hz: Number | None = Field(None, ge=50, le=5000, description="Expected rate: finds the phase of a stream. [Hz]")
+    interval_extra_us: Number | None = Field(
+        None, ge=0, le=20_000, description="Time of the serial write, which a stream's intervals leave out. [us]"
+    )
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.sensors <= MAX_SENSORS:
-            raise InvalidParameter(f"{self.sensors} sensors", field="sensors", limit=f"1 to {MAX_SENSORS}")
-        names = self.columns.field
-        if names and len(names) != self.sensors:
+    def check(self) -> None:
+        """Refuse members that contradict each other, after a vehicle's profile completed them.
+
+        Raises
+        ------
+        InvalidParameter
+            The field is a path within the declaration.
+        """
+        columns, sensors = self.table, self.sensors.sensor_count
+        if columns.delimiter == columns.decimal:
             raise InvalidParameter(
-                f"columns of {len(names)} sensors, but {self.sensors} sensors",
-                field="columns.field",
-                limit=f"{self.sensors} triples",
+                f"delimiter {columns.delimiter!r} with decimal {columns.decimal!r}",
+                field="columns.delimiter",
+                limit="',', ';' or tab, and '.' or ',' that differ",
             )
-        for name, shape in (("vehicle_from_sensor", (3, 3)), ("offsets_ut", (3,))):
-            value = getattr(self, name)
-            if value is None:
-                continue
-            array = np.asarray(value, float)
-            if array.shape != (self.sensors, *shape) or not np.isfinite(array).all():
-                raise InvalidParameter(
-                    f"{name} has shape {array.shape}", field=name, limit=f"finite, shape {(self.sensors, *shape)}"
-                )
-            object.__setattr__(self, name, array)
-        turns = self.vehicle_from_sensor
-        if turns is not None and not (
-            np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6)
-            and np.allclose(np.linalg.det(turns), 1, atol=1e-6)
-        ):
-            raise InvalidParameter("not all are rotations", field="vehicle_from_sensor", limit="rotation matrices")
-        if not all(np.isfinite(v) for v in self.clock_offsets_s.values()):
-            raise InvalidParameter("clock offsets are finite", field="clock_offsets_s", limit="finite seconds")
-        _check_range("speed_m_s", self.speed_m_s, 0.1, 100)
-        _check_range("rate_hz", self.rate_hz, 50, 5000)
-        _check_range("interval_extra_us", self.interval_extra_us, 0, 20_000)
+        if columns.field and len(columns.field) != sensors:
+            raise InvalidParameter(
+                f"columns of {len(columns.field)} sensors, but {sensors} sensors",
+                field="columns.field",
+                limit=f"{sensors} triples",
+            )
+
+    @cached_property
+    def sensors(self) -> MagnetometerBar:
+        """The bar that recorded."""
+        return (self.bar or BarDeclaration()).magnetometers
+
+    @cached_property
+    def table(self) -> TraceColumns:
+        """Columns of plain files."""
+        return self.columns or TraceColumns()
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,11 +169,6 @@ class TraceLimits:
     can_frames: int = 20_000_000  # largest number of frames of CAN logs
     min_rate_hz: float = 100.0  # [Hz] slowest trace
     left_out: float = 0.05  # largest share of rows that may be left out before the file is refused
-
-
-def _check_range(name: str, value: float | None, low: float, high: float) -> None:
-    if value is not None and not low <= value <= high:
-        raise InvalidParameter(f"{name} is {value:g}", field=name, limit=f"{low:g} to {high:g}")
 
 
 # === Report about reading a trace: what was read, replaced and left out.

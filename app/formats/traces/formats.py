@@ -82,7 +82,7 @@ class TraceReading:
 
     def shift_s(self, part: Part) -> float:
         """What is added to the times of a file. [s]"""
-        return self.declaration.clock_offsets_s.get(part.name, 0.0)
+        return (self.declaration.clock_offsets_s or {}).get(part.name, 0.0)
 
 
 TraceReader = Callable[[Part, TraceReading], None]
@@ -92,8 +92,10 @@ TraceReader = Callable[[Part, TraceReading], None]
 
 def _read_stream(part: Part, reading: TraceReading) -> None:
     declaration, report = reading.declaration, reading.report
-    reader = StreamReader(part.content(), part.name, declaration.sensors, declaration.rate_hz, reading.limits, report)
-    t, values = reader.read(declaration.interval_extra_us)
+    reader = StreamReader(
+        part.content(), part.name, declaration.sensors.sensor_count, declaration.rate_hz, reading.limits, report
+    )
+    t, values = reader.read(declaration.interval_extra_us or 0.0)
     if not declaration.interval_extra_us:
         report.warn(
             f"the intervals in {part.name} leave out the time of the serial write: its clock may run slow; "
@@ -103,7 +105,7 @@ def _read_stream(part: Part, reading: TraceReading) -> None:
 
 
 def _read_recorder_field(part: Part, reading: TraceReading) -> None:
-    t, values = read_raw_data(part, reading.declaration.sensors, reading.limits, reading.report)
+    t, values = read_raw_data(part, reading.declaration.sensors.sensor_count, reading.limits, reading.report)
     _check_left_out(part.name, t.size, reading)
     reading.contents.set_field(part.name, t + reading.shift_s(part), values, metro=True)
 
@@ -111,7 +113,7 @@ def _read_recorder_field(part: Part, reading: TraceReading) -> None:
 def _read_recorder_speed(part: Part, reading: TraceReading) -> None:
     t, speed = read_raw_series(part, "Speed", reading.limits, reading.report)
     _check_left_out(part.name, t.size, reading)
-    reading.contents.speeds.append((Series(part.name, t + reading.shift_s(part), speed), SpeedUnit.KM_H))
+    reading.contents.speeds.append((Series(part.name, t + reading.shift_s(part), speed), "km/h"))
 
 
 def _read_recorder_steering(part: Part, reading: TraceReading) -> None:
@@ -124,15 +126,15 @@ def _read_recorder_steering(part: Part, reading: TraceReading) -> None:
 def _read_bag(part: Part, reading: TraceReading) -> None:
     from app.formats.bags.drive import read_fields  # only here: the libraries are an extra
 
-    found = read_fields(part.as_file(), reading.declaration.sensors, reading.limits.rows)
+    found = read_fields(part.as_file(), reading.declaration.sensors.sensor_count, reading.limits.rows)
     shift_s = reading.shift_s(part)
     reading.contents.set_field(part.name, found.t_s + shift_s, found.field_t, metro=False)
     if reading.declaration.unit is None:
         np.multiply(found.field_t, np.float32(_UT_PER_TESLA), out=found.field_t)
-        reading.contents.unit = FieldUnit.MICROTESLA
+        reading.contents.unit = "uT"
     if found.speed is not None:
         reading.contents.speeds.append(
-            (Series(f"the speed in {part.name}", found.speed[0] + shift_s, found.speed[1]), SpeedUnit.M_S)
+            (Series(f"the speed in {part.name}", found.speed[0] + shift_s, found.speed[1]), "m/s")
         )
 
 
@@ -145,7 +147,7 @@ def _read_parquet(part: Part, reading: TraceReading) -> None:
 
 
 def _take_table(part: Part, table: Table, reading: TraceReading) -> None:
-    contents, columns = reading.contents, reading.declaration.columns
+    contents, columns = reading.contents, reading.declaration.table
     _check_left_out(part.name, table.t_s.size, reading)
     t_s = table.t_s + reading.shift_s(part)
     if table.field is not None:

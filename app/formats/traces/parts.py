@@ -20,7 +20,6 @@ from app.formats.traces.declaration import (
     M_S_PER_UNIT,
     AngleUnit,
     SpeedUnit,
-    TimeUnit,
     TraceGap,
     TraceLimits,
     TraceReport,
@@ -246,10 +245,10 @@ def check_sampling(t: Floats, part: str, limits: TraceLimits, report: TraceRepor
     if not max(limits.min_rate_hz * 0.95, 1e-9) <= rate <= _MAX_RATE_HZ:
         units = [
             unit
-            for unit, scale in ((TimeUnit.MILLISECOND, 1e3), (TimeUnit.MICROSECOND, 1e6), (TimeUnit.NANOSECOND, 1e9))
+            for unit, scale in (("ms", 1e3), ("us", 1e6), ("ns", 1e9))
             if limits.min_rate_hz <= rate * scale <= 2000
         ]
-        cure = f"times look like {units[0].value}: declare the unit of time" if units else "record at a higher rate"
+        cure = f"times look like {units[0]}: declare the unit of time" if units else "record at a higher rate"
         raise InvalidParameter(
             f"{part} has {rate:.4g} samples a second",
             field="columns.time_unit" if units or rate > _MAX_RATE_HZ else part,
@@ -294,7 +293,7 @@ def clean_speed(series: Series, unit: SpeedUnit, limits: TraceLimits, report: Tr
 
 def clean_heading(series: Series, unit: AngleUnit, limits: TraceLimits, report: TraceReport) -> Series:
     """Headings in degrees from 0 to 360, without those that are none."""
-    value = np.degrees(series.value) if unit is AngleUnit.RADIAN else series.value
+    value = np.degrees(series.value) if unit == "rad" else series.value
     wild = np.isfinite(value) & (np.abs(value) > 720)
     report.leave_out(series.part, "headings-implausible", int(wild.sum()), "beyond two turns")
     with np.errstate(invalid="ignore"):

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from app.errors import InvalidParameter
 from app.formats.traces.can_log import align_speed
 from app.formats.traces.declaration import (
+    M_S_PER_UNIT,
     UT_PER_UNIT,
     AngleUnit,
     AxisConvention,
@@ -46,7 +47,7 @@ _RAW_UT = (8.0, 2000.0)  # [uT] plausible median magnitudes at raw sensors; offs
 _AGREE = 0.2  # share by which the means of calibrated sensors differ at most
 _CHECKED = 20_000  # samples by which the unit is checked; speed only
 _BLOCK = 1 << 16  # samples that are converted at a time; bounds the memory
-_VEHICLE_FROM = {AxisConvention.ISO8855: (1, 1, 1), AxisConvention.FLU: (1, 1, 1), AxisConvention.FRD: (1, -1, -1)}
+_VEHICLE_FROM: dict[AxisConvention, tuple[int, int, int]] = {"ISO8855": (1, 1, 1), "FLU": (1, 1, 1), "FRD": (1, -1, -1)}
 
 
 def convert_field(
@@ -60,33 +61,31 @@ def convert_field(
     InvalidParameter
         Unit or axes are not declared where the format does not fix them, or the unit is implausible.
     """
-    unit = declaration.unit or known_unit or (FieldUnit.MICROTESLA if metro else None)
-    axes = declaration.axes or (AxisConvention.FRD if metro else None)
+    unit = declaration.unit or known_unit or ("uT" if metro else None)
+    axes = declaration.axes or ("FRD" if metro else None)
     if unit is None:
         raise InvalidParameter(
             f"the unit of the field in {part} is not declared",
             field="unit",
-            limit=", ".join(u.value for u in FieldUnit),
+            limit=", ".join(UT_PER_UNIT),
             cure="declare it",
         )
-    if axes is None and declaration.vehicle_from_sensor is None:
+    turns = declaration.sensors.vehicle_from_sensor if declaration.bar and declaration.bar.is_turned else None
+    if axes is None and turns is None:
         raise InvalidParameter(
             f"the axes of the field in {part} are not declared",
             field="axes",
-            limit=", ".join(a.value for a in AxisConvention),
+            limit=", ".join(_VEHICLE_FROM),
             cure="declare them, or the rotation of each sensor",
         )
     scale = np.float32(UT_PER_UNIT[unit])
-    offsets = np.float32(0) if declaration.offsets_ut is None else declaration.offsets_ut.astype(np.float32)
-    some = field[:: max(len(field) // _CHECKED, 1)] * scale - offsets
+    some = field[:: max(len(field) // _CHECKED, 1)] * scale
     _check_unit(some, part, unit, declaration)
-    turns = declaration.vehicle_from_sensor
     signs = np.array(_VEHICLE_FROM[axes] if axes else (1, 1, 1), np.float32)
     empty = wild = 0
     for at in range(0, len(field), _BLOCK):  # an hour's trace is not copied
         piece = field[at : at + _BLOCK]
         piece *= scale
-        piece -= offsets
         missing = ~np.isfinite(piece).all(2)
         with np.errstate(invalid="ignore"):
             beyond = ~missing & ~(np.abs(piece) <= MAX_FIELD_UT).all(2)
@@ -117,9 +116,9 @@ def _check_unit(field: Field, part: str, unit: FieldUnit, declaration: TraceDecl
     low, high = EARTH_UT if agree else _RAW_UT
     if low <= size <= high:
         return
-    fitting = [u.value for u in FieldUnit if u is not unit and low <= size * UT_PER_UNIT[u] / UT_PER_UNIT[unit] <= high]
+    fitting = [u for u in UT_PER_UNIT if u != unit and low <= size * UT_PER_UNIT[u] / UT_PER_UNIT[unit] <= high]
     raise InvalidParameter(
-        f"with {unit.value}, {part} has a field of {size:.4g} uT at a sensor"
+        f"with {unit}, {part} has a field of {size:.4g} uT at a sensor"
         + (" after calibration" if declaration.calibrated else ", the same at all of them" if agree else ""),
         field="unit",
         limit=f"{low:g} to {high:g} uT: the earth's field" + ("" if agree else " and the sensors' offsets"),
@@ -179,9 +178,10 @@ def read_trace(
         An optional library is not installed.
     """
     declaration, limits = declaration or TraceDeclaration(), limits or TraceLimits()
+    declaration.check()
     report = TraceReport()
     opened = open_parts(parts, limits)
-    formats = {part.name: find_trace_format(part, declaration.formats.get(part.name)) for part in opened}
+    formats = {part.name: find_trace_format(part, (declaration.formats or {}).get(part.name)) for part in opened}
     report.formats |= {name: TraceFormat(found.name) for name, found in formats.items()}
     dbc = [part for part in opened if report.formats[part.name] is TraceFormat.DBC]
     reading = TraceReading(declaration, limits, report, dbc)
@@ -210,7 +210,7 @@ def _assemble(
         t = t - origin
         others = [s.part for s, _ in found.speeds] + [s.part for s, _ in found.headings]
         for name in {found.field_part, *others}:
-            report.clock_offsets_s[name] = declaration.clock_offsets_s.get(name, 0.0) - origin
+            report.clock_offsets_s[name] = (declaration.clock_offsets_s or {}).get(name, 0.0) - origin
     check_sampling(t, found.field_part, limits, report)
     values = convert_field(values, found.field_part, declaration, found.metro, report, found.unit)
 
@@ -257,7 +257,7 @@ def _add_can(
         assert declaration.can is not None
         offset = declaration.can.offset_s
         if offset is None:
-            offset = align_speed(t, values, declaration.references, cleaned.get("speed"), part, report)
+            offset = align_speed(t, values, declaration.sensors.references, cleaned.get("speed"), part, report)
         report.clock_offsets_s[part] = offset
         if "speed" in cleaned:
             speeds.insert(0, Series(part, cleaned["speed"].t_s + offset, cleaned["speed"].value))
@@ -267,27 +267,27 @@ def _add_can(
 
 def _speed_unit(unit: str | None, part: str) -> SpeedUnit:
     text = (unit or "").strip().lower()
-    try:
-        return SpeedUnit(_SPEED_ALIASES.get(text, text))
-    except ValueError as error:
-        raise InvalidParameter(
-            f"the unit of speed in {part} is {unit!r}" if unit else f"the unit of speed in {part} is not declared",
-            field="can.speed.unit",
-            limit=", ".join(u.value for u in SpeedUnit),
-            cure="declare the unit of the signal",
-        ) from error
+    text = _SPEED_ALIASES.get(text, text)
+    if found := next((known for known in M_S_PER_UNIT if known == text), None):
+        return found
+    raise InvalidParameter(
+        f"the unit of speed in {part} is {unit!r}" if unit else f"the unit of speed in {part} is not declared",
+        field="can.speed.unit",
+        limit=", ".join(M_S_PER_UNIT),
+        cure="declare the unit of the signal",
+    )
 
 
 def _angle_unit(unit: str | None, part: str) -> AngleUnit:
     text = (unit or "").strip().lower()
     if text in ("deg", "degree", "degrees", "°"):
-        return AngleUnit.DEGREE
+        return "deg"
     if text in ("rad", "radian", "radians"):
-        return AngleUnit.RADIAN
+        return "rad"
     raise InvalidParameter(
         f"the unit of heading in {part} is {unit!r}" if unit else f"the unit of heading in {part} is not declared",
         field="can.heading.unit",
-        limit=", ".join(u.value for u in AngleUnit),
+        limit="deg, rad",
         cure="declare the unit of the signal",
     )
 

@@ -22,7 +22,6 @@ from app.formats.text import (
 )
 from app.formats.traces.declaration import (
     S_PER_UNIT,
-    TimeUnit,
     TraceColumns,
     TraceDeclaration,
     TraceLimits,
@@ -126,11 +125,11 @@ def read_csv(part: Part, declaration: TraceDeclaration, limits: TraceLimits, rep
         Columns are missing, or the delimiter is another one.
     UploadTooLarge, UnreadableUpload
     """
-    columns = declaration.columns
+    columns = declaration.table
     names = read_header(part, columns.delimiter)
     _check_delimiter(part, names, columns)
     wanted, sensors = _wanted(part.name, names, declaration)
-    iso = _text_to_seconds if columns.time_unit is TimeUnit.ISO else None
+    iso = _text_to_seconds if columns.time_unit == "iso" else None
     places = tuple(names.index(name) for name in wanted)
     numbers = NumberColumns(part.name, places, len(names), Dialect(columns.delimiter, columns.decimal), iso)
     return _table(read_rows(part, numbers, limits, report), wanted, sensors, columns)
@@ -180,7 +179,7 @@ def read_parquet(part: Part, declaration: TraceDeclaration, limits: TraceLimits,
                 raise
             raise _damaged(part) from error
 
-    return _table(blocks(), wanted, sensors, declaration.columns)
+    return _table(blocks(), wanted, sensors, declaration.table)
 
 
 def _column(array: Any, name: str) -> Floats:
@@ -201,13 +200,13 @@ def _column(array: Any, name: str) -> Floats:
 
 def _wanted(part: str, names: Sequence[str], declaration: TraceDeclaration) -> tuple[list[str], int]:
     """Columns to read: time, then fields, speed and heading as far as they are there; and the number of sensors."""
-    columns = declaration.columns
-    fields = [name for triple in columns.field_names(declaration.sensors) for name in triple]
+    columns = declaration.table
+    fields = [name for triple in columns.field_names(declaration.sensors.sensor_count) for name in triple]
     series = [n for n in (columns.speed, columns.heading) if n is not None and n in names]
     require_columns(part, names, [columns.time], cure=_CURE)
     if any(name in names for name in fields) or not series:
         require_columns(part, names, fields, cure=_CURE)
-        return [columns.time, *fields, *series], declaration.sensors
+        return [columns.time, *fields, *series], declaration.sensors.sensor_count
     return [columns.time, *series], 0
 
 

@@ -1,262 +1,249 @@
-"""What the context of an upload declares of its files, checked, as the readers and the decoders take it."""
+"""The context of an upload: what is declared of it, as a client sends it, as it is stored, and as decoders read it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from datetime import date
-from typing import TYPE_CHECKING, Any, Literal
+from functools import cached_property
+from typing import Annotated, Any, Literal
 
-import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field, JsonValue, model_validator
 
-from app.decoders.cerpm.signal import SignalRules
-from app.decoders.cerpm.verify import FreshnessRules
+from app.decoders.cerpm.signal import ReceiverDeclaration
+from app.decoders.cerpm.verify import FreshnessDeclaration
 from app.decoders.magnet.identify import TagFormat
-from app.errors import InvalidParameter
-from app.formats.logs import LogClock, TimeScale
-from app.formats.packets.rows import PacketDeclaration, PayloadText
+from app.errors import InvalidParameter, naming
+from app.formats.images import ImageHeader, check_thermal_range
+from app.formats.packets.rows import PacketDeclaration
 from app.formats.poses import PoseDeclaration
-from app.formats.traces.declaration import (
-    AngleUnit,
-    AxisConvention,
-    CanDeclaration,
-    CanSignal,
-    FieldUnit,
-    SpeedUnit,
-    TimeUnit,
-    TraceColumns,
-    TraceDeclaration,
-    TraceFormat,
-)
-from app.lanes.types import LaneRules
-from app.sensors.magnetometer_bar import MagnetometerBar, SensorRole
+from app.formats.traces.declaration import TraceDeclaration
+from app.geodesy import check_lon_lat
+from app.inputs import Declaration, Flag, Name, Number, Text, Time
+from app.lanes.types import LaneDeclaration
+from app.sensors.camera import Camera, CameraDeclaration
 
-if TYPE_CHECKING:  # it loads numba
-    from app.lanes.control import Controller
-
-# === Recordings of magnetometers.
+# === What an upload declares of its files.
 
 
-TRACE_METHODS = ("matched", "metro")
-MAX_REACH_M = 20_000.0
+TraceMethod = Literal["matched", "metro"]
 
 
-@dataclass(frozen=True, slots=True)
-class TraceTerms:
-    """A declaration as the readers and the decoder know it."""
+class DeclaredTrace(TraceDeclaration):
+    """What is declared of a recording. METRO's stream and recorder files need nothing: send {}."""
 
-    bar: MagnetometerBar
-    declaration: TraceDeclaration
-    formats: tuple[TagFormat, ...] = ()  # tags to look for where the registry has none nearby
-    method: str = TRACE_METHODS[0]  # ``matched``, or ``metro`` for the paper's pipeline
-    reach_m: float = 2000.0  # [m] how far from the coarse position the drive may lead
+    model_config = ConfigDict(json_schema_extra={"examples": [{}, {"unit": "uT", "axes": "FRD"}]})
+
+    tag_formats: tuple[TagFormat, ...] | None = Field(
+        None, min_length=1, max_length=20, description="Tags to look for where none is registered nearby."
+    )
+    method: TraceMethod = Field("matched", description="`metro` is the paper's own pipeline.")
+    reach_m: Number = Field(
+        2000.0, gt=0, le=20_000, description="How far from the coarse position the drive may lead. [m]"
+    )
 
 
-def trace_terms(declared: Mapping[str, Any]) -> TraceTerms:
-    """Check a declaration.
+class DeclaredPackets(PacketDeclaration):
+    """The declaration of a packet log. Supported formats need none: send {}."""
 
-    Parameters
-    ----------
-    declared : dict
-        As `app.api.decodes.schemas.TraceIn` describes it; what is left out has METRO's default.
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{}, {"clock": {"scale": "gps-s"}, "columns": {"payload": "raw"}}]},
+    )
 
-    Raises
-    ------
-    InvalidParameter
-        A value is out of its limits, or values contradict each other; the field is below ``trace``.
-    """
-    try:
-        bar = _bar(declared.get("bar") or {})
-        method = declared.get("method", TRACE_METHODS[0])
-        if method not in TRACE_METHODS:
-            raise InvalidParameter(f"there is no method {method}", field="method", limit=", ".join(TRACE_METHODS))
-        reach_m = float(declared.get("reach_m", 2000.0))
-        if not 0 < reach_m <= MAX_REACH_M:
+    files: dict[Name, Literal["packets", "poses", "frame"]] | None = Field(
+        None, max_length=32, description="Kinds of files in a ZIP whose content does not show it, by name."
+    )
+    poses: PoseDeclaration | None = None
+    receiver: ReceiverDeclaration | None = None
+    freshness: FreshnessDeclaration | None = None
+    lane: LaneDeclaration | None = None
+    method: Literal["waymark", "paper"] = Field("waymark", description="`paper` is the CERPM paper's own way.")
+    accept_clear: Flag = Field(
+        False,
+        description="Use markers whose packets were received in clear only; the path is then not for localization.",
+    )
+    steering: Literal["predictive", "stanley", "stanley-lookahead", "none"] = Field(
+        "predictive", description="Controller of the simulated drive along the path."
+    )
+
+
+class DeclaredFrames(Declaration):
+    """What is declared of the frames of a drive: a ZIP of pictures or a video."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"rate_hz": 10.0}, {"poses": {"accuracy_m": 1.5}}]})
+
+    rate_hz: Number | None = Field(
+        None,
+        ge=0.001,
+        le=1000,
+        description="Frames a second from captured_at on, where the files state no times. A JPEG with it is a raw "
+        "MJPEG stream. [Hz]",
+    )
+    poses: PoseDeclaration | None = Field(None, description="Of frames.csv, or of a track beside the frames.")
+
+    @cached_property
+    def track(self) -> PoseDeclaration:
+        """The list of frames, or the track beside them."""
+        return self.poses or PoseDeclaration()
+
+
+# === The context of an upload.
+
+
+VIEW_RANGE_M = 100.0
+MAX_ACCURACY_M = 20_000.0
+CONTEXT_EXAMPLE: dict[str, JsonValue] = {
+    "coarse_position": {"lon_deg": 114.17921, "lat_deg": 22.30413, "accuracy_m": 15.0},
+    "heading_deg": 78.0,
+    "camera": {
+        "width_px": 1920,
+        "height_px": 1080,
+        "horizontal_fov_deg": 70.0,
+        "height_m": 1.57,
+        "depression_deg": 23.0,
+    },
+    "captured_at": "2026-05-04T08:30:00Z",
+}
+
+
+class CoarsePosition(Declaration):
+    """The vehicle's approximate position."""
+
+    lon_deg: Number = Field(description="Longitude, -180 to 180. [deg]")
+    lat_deg: Number = Field(description="Latitude, -90 to 90. [deg]")
+    accuracy_m: Number = Field(description="Radius that holds the vehicle, up to 20 000. [m]")
+
+    @model_validator(mode="after")
+    def _is_on_earth(self) -> CoarsePosition:
+        check_lon_lat(self.lon_deg, self.lat_deg, field="coarse_position")
+        if not 0 < self.accuracy_m <= MAX_ACCURACY_M:
             raise InvalidParameter(
-                f"reach_m is {reach_m:g}", field="reach_m", limit=f"above 0, at most {MAX_REACH_M:g} m"
+                f"accuracy_m is {self.accuracy_m:g}",
+                field="accuracy_m",
+                limit=f"above 0, at most {MAX_ACCURACY_M:g} m",
+                cure="give the radius that holds the vehicle; decimals alone cannot place a plate much further away",
             )
-        formats = tuple(TagFormat(**entry) for entry in declared.get("tag_formats", ()))
-        return TraceTerms(bar, _declaration(declared, bar), formats, method, reach_m)
-    except InvalidParameter as error:
-        error.field = f"trace.{error.field}" if error.field else "trace"
-        raise
+        return self
+
+    @property
+    def reach_m(self) -> float:
+        """How far from here a plate in view can be. [m]"""
+        return self.accuracy_m + VIEW_RANGE_M
 
 
-def _bar(declared: Mapping[str, Any]) -> MagnetometerBar:
-    forward_m, clearance_m = float(declared.get("forward_m", 0.0)), declared.get("clearance_m")
-    sensors = declared.get("sensors")
-    if not sensors:
-        return MagnetometerBar.metro(forward_m=forward_m, clearance_m=clearance_m)
-    positions = np.array([sensor["position_m"] for sensor in sensors], float)
-    positions[:, 0] += forward_m
-    turns = [sensor.get("vehicle_from_sensor") or np.eye(3) for sensor in sensors]
-    roles = tuple(SensorRole(sensor.get("role", "array")) for sensor in sensors)
-    return MagnetometerBar(positions, roles, np.array(turns, float), clearance_m=clearance_m)
-
-
-def _declaration(declared: Mapping[str, Any], bar: MagnetometerBar) -> TraceDeclaration:
-    columns, can = declared.get("columns") or {}, declared.get("can")
-    turned = any(sensor.get("vehicle_from_sensor") for sensor in (declared.get("bar") or {}).get("sensors") or ())
-    declared_options = {
-        name: declared[name]
-        for name in ("calibrated", "background_removed", "speed_m_s", "rate_hz", "interval_extra_us", "clock_offsets_s")
-        if declared.get(name) is not None
-    }
-    return TraceDeclaration(
-        sensors=bar.sensor_count,
-        unit=FieldUnit(declared["unit"]) if declared.get("unit") else None,
-        axes=AxisConvention(declared["axes"]) if declared.get("axes") else None,
-        vehicle_from_sensor=bar.vehicle_from_sensor if turned else None,
-        references=tuple(int(i) for i in bar.references),
-        columns=_columns(columns),
-        can=_can(can) if can else None,
-        formats={name: TraceFormat(kind) for name, kind in (declared.get("formats") or {}).items()},
-        **declared_options,
-    )
-
-
-def _columns(declared: Mapping[str, object]) -> TraceColumns:
-    kinds: dict[str, Any] = {"time_unit": TimeUnit, "speed_unit": SpeedUnit, "heading_unit": AngleUnit}
-    values: dict[str, Any] = {name: kinds.get(name, lambda same: same)(value) for name, value in declared.items()}
-    if "field" in values:
-        values["field"] = tuple(tuple(names) for names in values["field"])
-    return TraceColumns(**values)
-
-
-def _can(declared: Mapping[str, Any]) -> CanDeclaration:
-    signals = {name: CanSignal(**declared[name]) for name in ("speed", "heading") if declared.get(name)}
-    return CanDeclaration(**signals, offset_s=declared.get("offset_s"), channel=declared.get("channel"))
-
-
-# === Packet logs of CERPMs.
-
-
-PACKET_METHODS = ("waymark", "paper")
-FILE_KINDS = ("packets", "poses", "frame")
-PREDICTIVE, NO_CHECK = "predictive", "none"
-
-
-@dataclass(frozen=True, slots=True)
-class PacketTerms:
-    """A declaration as the readers and the decoder know it."""
-
-    packets: PacketDeclaration
-    poses: PoseDeclaration
-    files: Mapping[str, str]  # kind of a file by its name, where its content does not show it
-    freshness: FreshnessRules
-    lane: LaneRules
-    method: Literal["waymark", "paper"]  # ``waymark``, or ``paper`` for section 2.2 of the CERPM paper
-    accept_clear: bool  # use markers whose packets were received in clear only, without a tag
-    controller: Controller | None  # of the check of steering; none is made without
-    signal: SignalRules  # with the figures of the receiver that were declared
-
-
-def packet_terms(declared: Mapping[str, Any]) -> PacketTerms:
-    """Check a declaration.
-
-    Parameters
-    ----------
-    declared : mapping
-        As `app.api.decodes.schemas.PacketsIn` describes it.
-
-    Raises
-    ------
-    InvalidParameter
-        A figure is out of its limits; the field is below ``packets``.
-    """
-    try:
-        method = declared.get("method", PACKET_METHODS[0])
-        if method not in PACKET_METHODS:
-            raise InvalidParameter(f"there is no method {method}", field="method", limit=", ".join(PACKET_METHODS))
-        files = declared.get("files") or {}
-        for name, kind in files.items():
-            if kind not in FILE_KINDS:
-                raise InvalidParameter(f"{name} is of no kind {kind}", field="files", limit=", ".join(FILE_KINDS))
-        steering = declared.get("steering", PREDICTIVE)
-        return PacketTerms(
-            _packet_declaration(declared),
-            pose_declaration(declared.get("poses") or {}),
-            files,
-            FreshnessRules(**(declared.get("freshness") or {})),
-            LaneRules(**(declared.get("lane") or {})),
-            method,
-            bool(declared.get("accept_clear", False)),
-            None if steering == NO_CHECK else _controller(steering),
-            SignalRules(**(declared.get("receiver") or {})),
-        )
-    except InvalidParameter as error:
-        error.field = f"packets.{error.field}" if error.field else "packets"
-        raise
-
-
-def _controller(name: str) -> Controller:
-    from app.lanes.control import Controller
-
-    return Controller(name)
-
-
-def _packet_declaration(declared: Mapping[str, Any]) -> PacketDeclaration:
-    return PacketDeclaration(
-        _clock(declared.get("clock") or {}),
-        declared.get("columns") or {},
-        PayloadText(declared.get("payload_text", "auto")),
-    )
-
-
-# === Tracks and frames of a drive.
-
-
-def pose_declaration(declared: Mapping[str, Any]) -> PoseDeclaration:
-    """The declaration of a track, as `app.api.decodes.schemas.PosesIn` describes it."""
-    return PoseDeclaration(
-        _clock(declared.get("clock") or {}),
-        declared.get("columns") or {},
-        declared.get("crs"),
-        _date(declared["date"]) if declared.get("date") else None,
-        forward_m=float(declared.get("forward_m", 0.0)),
-        left_m=float(declared.get("left_m", 0.0)),
-        accuracy_m=declared.get("accuracy_m"),
-    )
-
-
-def _date(text: str) -> date:
-    try:
-        return date.fromisoformat(text)
-    except ValueError as error:
+def _check_heading(heading_deg: float | None) -> float | None:
+    if heading_deg is not None and not 0 <= heading_deg <= 360:
         raise InvalidParameter(
-            f"{text} is no date", field="poses.date", limit="YYYY-MM-DD", cure="give the UTC date of the first position"
-        ) from error
+            f"heading_deg is {heading_deg:g}", limit="0 to 360 deg", cure="give degrees clockwise from true north"
+        )
+    return heading_deg
 
 
-def _clock(declared: Mapping[str, Any]) -> LogClock:
-    return LogClock(
-        TimeScale(declared.get("scale", "auto")),
-        float(declared.get("offset_s", 0.0)),
-        float(declared.get("utc_offset_s", 0.0)),
+class Profile(Declaration):
+    """What stays the same from upload to upload of a vehicle."""
+
+    camera: CameraDeclaration | None = None
+    thermal: Flag | None = Field(None, description="The frames are from a thermal camera.")
+    thermal_range: tuple[Number, Number] | None = Field(
+        None, description="Counts of 16-bit thermal frames that become 0 and 255."
+    )
+    frames: DeclaredFrames | None = Field(None, description="Frames of a drive: their rate, and where they were taken.")
+    trace: DeclaredTrace | None = Field(
+        None,
+        description="Magnetometer traces; {} for METRO's own formats. In a context it states that the file is one.",
+    )
+    packets: DeclaredPackets | None = Field(
+        None,
+        description="Packet logs of CERPMs, alone or in a ZIP with the vehicle's poses and a frame; {} for supported "
+        "formats. In a context it states that the file is one.",
     )
 
+    def check(self) -> None:
+        """Refuse what is incomplete or contradicts itself, after a vehicle's profile completed an upload's context.
 
-@dataclass(frozen=True, slots=True)
-class FrameTerms:
-    """What is declared of the frames of a drive."""
+        Raises
+        ------
+        InvalidParameter
+            The field is a path within the context.
+        """
+        if self.camera is not None:
+            self.camera.check()
+        if self.trace is not None:
+            with naming("trace"):
+                self.trace.check()
+        if self.thermal_range is not None:
+            check_thermal_range(self.thermal_range)
+            if not self.thermal:
+                raise InvalidParameter(
+                    "thermal_range means nothing in a frame that is not thermal",
+                    field="thermal_range",
+                    limit="with thermal only",
+                    cure="set thermal to true, or leave thermal_range out",
+                )
 
-    rate_hz: float | None = None  # [Hz] frames a second
-    poses: PoseDeclaration = field(default_factory=PoseDeclaration)  # of a list of frames, or of a track beside them
+
+class _Context(Profile):
+    coarse_position: CoarsePosition | None = None
+    heading_deg: Annotated[Number | None, AfterValidator(_check_heading)] = Field(
+        None, description="Of the vehicle, clockwise from true north. [deg]"
+    )
+    captured_at: Time | None = Field(None, description="When the frame was taken, or the trace or the video began.")
 
 
-def frame_terms(declared: Mapping[str, Any]) -> FrameTerms:
-    """Check the section `frames` of a context.
+class UploadContext(_Context):
+    """The context of an upload. Everything is optional, but without a coarse position nothing is matched."""
 
-    Raises
-    ------
-    InvalidParameter
-        A figure is out of its limits; the field is below ``frames``.
-    """
-    rate_hz = declared.get("rate_hz")
-    if rate_hz is not None and not 0.001 <= rate_hz <= 1000:
-        raise InvalidParameter(f"the frame rate is {rate_hz:g}", field="frames.rate_hz", limit="0.001 to 1000 Hz")
-    try:
-        return FrameTerms(rate_hz, pose_declaration(declared.get("poses") or {}))
-    except InvalidParameter as error:
-        error.field = f"frames.{error.field}" if error.field else "frames"
-        raise
+    model_config = ConfigDict(json_schema_extra={"examples": [CONTEXT_EXAMPLE]})
+
+    vehicle: Text | None = Field(
+        None,
+        min_length=1,
+        max_length=80,
+        description="Name or id of the vehicle: its profile gives what the context leaves out.",
+    )
+
+    @property
+    def stated(self) -> dict[str, object]:
+        """The members that were sent and nothing else; one that is null is declared to be unknown."""
+        return self.model_dump(mode="json", exclude_unset=True, exclude={"vehicle"})
+
+
+class UsedVehicle(Declaration):
+    """The vehicle of an upload, and whose word each member of the context is."""
+
+    id: str
+    name: str
+    version: int
+    sources: dict[str, str]  # path of each member to ``upload``, ``vehicle`` or ``default``
+
+
+class DecodeContext(_Context):
+    """Everything that comes with an upload, completed by its vehicle's profile."""
+
+    vehicle: UsedVehicle | None = None
+    file_name: str | None = None  # of the uploaded file; its suffix distinguishes kinds of text files
+
+    @model_validator(mode="after")
+    def _agrees(self) -> DecodeContext:
+        if self.trace is not None and self.packets is not None:
+            raise InvalidParameter(
+                "an upload is a trace or a packet log", field="packets", limit="one of trace, packets", cure="send one"
+            )
+        self.check()
+        return self
+
+    @property
+    def is_thermal(self) -> bool:
+        """Whether the frames are from a thermal camera."""
+        return self.thermal is True
+
+    def camera_of(self, frame: ImageHeader) -> Camera | None:
+        """The camera of a frame; None where none is declared.
+
+        Raises
+        ------
+        InvalidParameter
+            The frame has another size than the camera.
+        """
+        return self.camera.camera_of(frame.width_px, frame.height_px) if self.camera is not None else None
+
+    def document(self) -> dict[str, Any]:
+        """The context as it is stored: the members that were declared."""
+        return self.model_dump(mode="json", exclude_unset=True)

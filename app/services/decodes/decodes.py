@@ -20,7 +20,8 @@ from app.registry.decodes import DecodeFilter, DecodeRow
 from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
-from app.services.decodes.context import ContextInput, DecodeKind, DecodeRules, context_from_document
+from app.services.decodes.context import DecodeKind, DecodeRules
+from app.services.decodes.declarations import DeclaredPackets, DeclaredTrace, DecodeContext, UploadContext
 from app.services.decodes.documents import DecodeDocument, DecodeHead, decode_document, decode_head
 from app.services.decodes.frame_poses import track_csv, track_geojson, track_gpx, track_points
 from app.services.decodes.outputs import readings_csv, readings_geojson
@@ -74,9 +75,10 @@ class Decodes:
         self,
         caller: Caller,
         file: SpooledFile,
-        given: ContextInput,
+        stated: UploadContext,
         key: IdempotencyKey | None = None,
         *,
+        name: str = "",
         as_job: bool = False,
     ) -> tuple[DecodeDocument, bool]:
         """Decode an upload now, or queue it if that takes too long, or in any case `as_job`.
@@ -101,7 +103,7 @@ class Decodes:
             earlier = find_response(connection, caller.agency_id, key, now)
             if earlier is not None:
                 return earlier, True
-            context = resolve_context(connection, caller, given, file)
+            context = resolve_context(connection, caller, stated, file, name)
         handler = next(handler for handler in self._handlers if handler.accepts(context, file))
         upload = Upload(caller.agency_id, author_of(caller), file, context, now)
         if handler.is_job(file) or as_job:
@@ -116,7 +118,7 @@ class Decodes:
         handler = next(handler for handler in self._handlers if handler.kind == row.kind)
         with self._blobs.opened(row.upload_key) as file:
             author = Author(job.row.input.get("label", ""), job.row.holder_id)
-            context = context_from_document(row.context)
+            context = DecodeContext.model_validate(row.context)
             upload = Upload(job.row.agency_id, author, file, context, row.created_at, wait_s=_WAIT_S, job=job)
             self._path.decode_queued(job, upload, handler)
 
@@ -138,7 +140,7 @@ class Decodes:
             raise NotFound(f"decode {decode_id} has no upload", field="decode_id")
         handler = next(handler for handler in self._handlers if handler.kind == row.kind)
         with self._blobs.opened(row.upload_key) as file:
-            context = context_from_document(row.context)
+            context = DecodeContext.model_validate(row.context)
             upload = Upload(agency_id, Author(""), file, context, row.created_at, wait_s=_WAIT_S, again_id=decode_id)
             decoded, plot = self._path.decode_again(upload, handler)
         return dict(decoded.document), plot
@@ -255,8 +257,8 @@ class DecodeDetails:
             raise InvalidParameter(
                 f"from_s is {from_s:g}, to_s {to_s:g}", field="from_s", limit="from_s below to_s", cure="swap them"
             )
-        declared = row.context.get("trace") or {}
-        name = str(declared.get("file_name") or "recording")
+        context = DecodeContext.model_validate(row.context)
+        declared, name = context.trace or DeclaredTrace(), context.file_name or "recording"
         with self._blobs.opened(_upload_key(row)) as file:
             most, limits = min(points, MAX_POINTS), self._rules.traces
             return self._processes.run(read_samples, name, file, declared, names, from_s, to_s, most, limits)
@@ -270,8 +272,8 @@ class DecodeDetails:
             There is no such decode, it is of no packet log, or it is not done.
         """
         row = self._done(caller, decode_id, DecodeKind.PACKETS, "a packet log")
-        declared = row.context.get("packets") or {}
-        name = str(declared.get("file_name") or "packets")
+        context = DecodeContext.model_validate(row.context)
+        declared, name = context.packets or DeclaredPackets(), context.file_name or "packets"
         with self._blobs.opened(_upload_key(row)) as file:
             rules = self._rules
             files = self._processes.run(read_drive, name, file, declared, rules.packets, rules.images)

@@ -123,16 +123,11 @@ def decode_head(row: DecodeRow) -> DecodeHead:
         "created_at": row.created_at,
         "finished_at": row.finished_at,
         "context": {name: value for name, value in row.context.items() if name != "file_name"},
-        "file_name": _file_name(row.context),
+        "file_name": row.context.get("file_name"),
         "upload_bytes": row.upload_bytes,
         "error": cast("ErrorDocument | None", row.error),
         "links": _links(f"/v1/decodes/{row.id}", row.kind, row.result or {}),
     }
-
-
-def _file_name(context: Mapping[str, Any]) -> str | None:
-    declared = context.get("trace") or context.get("packets") or {}
-    return context.get("file_name") or declared.get("file_name")
 
 
 def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:

@@ -6,7 +6,7 @@ import io
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from typing import Any, Literal
@@ -16,21 +16,13 @@ import numpy.typing as npt
 from typing_extensions import TypedDict
 
 from app.formats.frame_list import FrameList, ListedFrame
-from app.formats.logs import LogClock, LogReport, has_zone
+from app.formats.logs import LogReport, has_zone
 from app.formats.text import TableWriter
 from app.geodesy.frames import metres_per_radian
 from app.registry.decodes import DecodeRow
 from app.sensors.pose_track import PoseTrack
-from app.services.decodes.context import (
-    MAX_ACCURACY_M,
-    CoarsePosition,
-    DecodeContext,
-    DecodeKind,
-    DecodeTimes,
-    clock_of,
-    stamp,
-)
-from app.services.decodes.declarations import frame_terms
+from app.services.decodes.context import DecodeKind, DecodeTimes, clock_of, stamp
+from app.services.decodes.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.tracks.files import gpx_document
 
 # === Positions of the vehicle's own receiver, as a decode keeps them for the track of its drive.
@@ -118,7 +110,7 @@ class FramePose:
     @property
     def coarse_position(self) -> CoarsePosition:
         """The position to look for markers from."""
-        return CoarsePosition(self.lon_deg, self.lat_deg, self.radius_m)
+        return CoarsePosition(lon_deg=self.lon_deg, lat_deg=self.lat_deg, accuracy_m=self.radius_m)
 
 
 class GapDocument(TypedDict):
@@ -134,7 +126,7 @@ class FramePlaces:
     """Times and places of the frames of one drive."""
 
     def __init__(self, context: DecodeContext, lists: FrameLists | None = None) -> None:
-        self._context, self._terms = context, frame_terms(context.frames or {})
+        self._context, self._frames = context, context.frames or DeclaredFrames()
         self._lists = lists or FrameLists()
         self._listed: Mapping[str, ListedFrame] = self._lists.frames.frames if self._lists.frames else {}
         self._track = self._lists.track or _track_of_list(self._listed)
@@ -172,12 +164,12 @@ class FramePlaces:
         row = self._listed.get(name)
         if row is not None and math.isfinite(row.time_s):
             return datetime.fromtimestamp(row.time_s, UTC)
-        if self._terms.rate_hz is not None:
+        if self._frames.rate_hz is not None:
             captured_at = self._context.captured_at
-            return captured_at + timedelta(seconds=ordinal / self._terms.rate_hz) if captured_at else None
+            return captured_at + timedelta(seconds=ordinal / self._frames.rate_hz) if captured_at else None
         if taken is None:
             return None
-        clock: LogClock = self._terms.poses.clock
+        clock = self._frames.track.times
         if not has_zone(taken) and not clock.utc_offset_s:
             self._warn("times of the pictures' EXIF without a zone were taken as UTC; declare frames.poses.clock")
         time_s = clock.read(taken)
@@ -204,7 +196,9 @@ class FramePlaces:
         """The context of one frame."""
         if pose is None or pose.source == "context":
             return self._context
-        return replace(self._context, coarse_position=pose.coarse_position, heading_deg=pose.heading_deg)
+        return self._context.model_copy(
+            update={"coarse_position": pose.coarse_position, "heading_deg": pose.heading_deg}
+        )
 
     def _warn(self, text: str) -> None:
         if text not in self.warnings:

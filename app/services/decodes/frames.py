@@ -27,8 +27,8 @@ from app.markers.reading import PlateReading
 from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.sensors.camera import Camera
-from app.services.decodes.context import CoarsePosition, DecodeContext, DecodeKind, DecodeRules
-from app.services.decodes.declarations import frame_terms
+from app.services.decodes.context import DecodeKind, DecodeRules
+from app.services.decodes.declarations import CoarsePosition, DeclaredFrames, DecodeContext
 from app.services.decodes.frame_documents import DriveNotes, ReadFrame, ReadMarker, frames_result
 from app.services.decodes.frame_poses import FramePlaces, FramePose, find_gaps
 from app.services.decodes.frame_tasks import FramePicture, FrameResult, FrameSearch, decode_frame, decode_frames
@@ -100,8 +100,8 @@ class FrameHandler(UploadHandler[FrameSignal]):
         """
         context, limits = upload.context, self._rules.images
         header = inspect_frame(upload.file, context, limits)
-        camera = context.camera.camera_for(header) if context.camera else None
-        picture = FramePicture(upload.file, context.thermal, context.thermal_range, limits)
+        camera = context.camera_of(header)
+        picture = FramePicture(upload.file, context.is_thermal, context.thermal_range, limits)
         search: Future[FrameSearch] = Future()
         pending = self._processes.submit(decode_frame, picture, search, wait_s=upload.wait_s)
         with cancelled_on_error(pending):
@@ -130,9 +130,9 @@ def inspect_frame(file: SpooledFile, context: DecodeContext, limits: ImageLimits
             cure="send the frame as the camera wrote it",
         )
     if file.path is None:
-        return inspect_image(file.read(), limits, thermal=context.thermal)
+        return inspect_image(file.read(), limits, thermal=context.is_thermal)
     with _LARGE:
-        return inspect_image(file.read(), limits, thermal=context.thermal)
+        return inspect_image(file.read(), limits, thermal=context.is_thermal)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ def read_frame(
     The speed is the one that successive frames show; that of the frame's pose goes first.
     """
     context, epoch = moment.context, decimal_year(moment.at or upload.observed_at)
-    camera = context.camera.camera_for(result.header) if context.camera else None
+    camera = context.camera_of(result.header)
     if moment.pose is not None and moment.pose.speed_m_s is not None:
         speed_m_s = moment.pose.speed_m_s
     markers = []
@@ -334,7 +334,7 @@ class PendingArchive:
             files = tuple(
                 (m.name, m.data) for m in read_members(file, limits, only=is_beside_frames) if m.error is None
             )
-            poses = frame_terms(context.frames or {}).poses
+            poses = (context.frames or DeclaredFrames()).track
             lists = self._processes.run(read_frame_lists, files, poses, wait_s=self._upload.wait_s)
             self._places = FramePlaces(context, lists)
         self._places.check_names([name for name in names if not is_beside_frames(name)])
@@ -349,11 +349,11 @@ class PendingArchive:
             file = SpooledFile.of(member.data)
             header = inspect_frame(file, context, images)
             moment = self._moment(member, header)
-            camera = moment.context.camera.camera_for(header) if moment.context.camera else None
+            camera = moment.context.camera_of(header)
         except WaymarkError as error:
             return ArchiveFrame(member.index, member.name, moment, error=error)
         nearby = self._markers_near(moment.context.coarse_position)
-        picture = FramePicture(file, context.thermal, context.thermal_range, images)
+        picture = FramePicture(file, context.is_thermal, context.thermal_range, images)
         pixels = header.width_px * header.height_px
         return ArchiveFrame(member.index, member.name, moment, picture, self._look_for(nearby, camera), nearby, pixels)
 
@@ -410,7 +410,7 @@ class PendingArchive:
         with self._database.read() as connection:
             for index, plates in confirmed.items():
                 frame, result = known[index]
-                camera = frame.moment.context.camera.camera_for(result.header) if frame.moment.context.camera else None
+                camera = frame.moment.context.camera_of(result.header)
                 others = tuple(one for one in result.readings if not isinstance(one, PlateReading))
                 readings = (*(with_pose(one, camera) for one in plates), *others)
                 self._frames[places[index]] = self._matched(connection, frame, replace(result, readings=readings))

@@ -21,8 +21,8 @@ from app.decoders.cerpm.merge import (
     grade_markers,
     match_known_markers,
 )
-from app.decoders.cerpm.signal import SignalReport, profile_signals
-from app.decoders.cerpm.verify import SequenceSpan, Verification
+from app.decoders.cerpm.signal import SignalReport, SignalRules, profile_signals
+from app.decoders.cerpm.verify import FreshnessRules, SequenceSpan, Verification
 from app.decoders.magnet.identify import MAX_TAGS, RegisteredTag
 from app.decoders.plate.pose import VehicleFix, fix_vehicle
 from app.families import FAMILIES, get_family
@@ -54,8 +54,7 @@ from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter, SpanRow
 from app.sensors.camera import Camera
 from app.services.access.agency_secrets import AgencySecrets
-from app.services.decodes.context import CoarsePosition
-from app.services.decodes.declarations import PacketTerms
+from app.services.decodes.declarations import CoarsePosition, DeclaredPackets
 from app.services.decodes.packet_tasks import DriveFiles
 
 MAX_CODEBOOK = 500
@@ -352,7 +351,7 @@ def find_known(
 def read_packets_of(
     files: DriveFiles,
     known: KnownMarkers,
-    terms: PacketTerms,
+    declared: DeclaredPackets,
     max_invalid_tags: int,
     *,
     received_at: datetime,
@@ -366,8 +365,8 @@ def read_packets_of(
             return None
         return derive_marker_key(known.agency_key, number)
 
-    freshness = replace(terms.freshness, uploaded_at_s=received_at.timestamp())
-    rules = MergeRules(accept_clear=terms.accept_clear)
+    freshness = FreshnessRules.of(declared.freshness).model_copy(update={"uploaded_at_s": received_at.timestamp()})
+    rules = MergeRules(accept_clear=declared.accept_clear)
     verification, merged = match_known_markers(
         files.packets, key_of, known.cerpms, files.track, freshness, rules, max_invalid_tags=max_invalid_tags
     )
@@ -376,7 +375,7 @@ def read_packets_of(
         int(number): (float(lon), float(lat))
         for number, lon, lat in zip(merged.number, merged.lon_deg, merged.lat_deg, strict=True)
     }
-    signal = profile_signals(verification.packets, places, files.track, terms.signal)
+    signal = profile_signals(verification.packets, places, files.track, SignalRules.of(declared.receiver))
     grade, localization_warnings = grade_markers(merged, verification, known.cerpms)
     return ReadPackets(
         verification, merged, signal, known, grade, localization_warnings, 1e3 * (time.perf_counter() - began)

@@ -17,8 +17,8 @@ from app.registry import decodes as store
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow
 from app.services.access.access import Caller
-from app.services.decodes.context import DecodeKind, DecodeRules, DecodeTimes, clock_of, context_from_document, stamp
-from app.services.decodes.declarations import frame_terms
+from app.services.decodes.context import DecodeKind, DecodeRules, DecodeTimes, clock_of, stamp
+from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.frame_poses import TrackGeometry
 from app.services.decodes.frame_tasks import FramePicture, annotate_frame
 from app.services.decodes.lane_documents import LaneCollection, lane_geojson, overlay_from_document
@@ -209,18 +209,18 @@ class DecodeOutputs:
                 field="frame",
                 cure="`frames` of the decode lists them; of a video, those in which something was found",
             )
-        context = context_from_document(row.context)
+        context = DecodeContext.model_validate(row.context)
         readings = result["readings"] if outlined else ()
         outlines = tuple(_outline(reading) for reading in readings if reading["frame"] == frame)
         with self._upload(row) as file:
             if row.kind == DecodeKind.VIDEO:
                 video = video_of(context, file, self._rules.archives)
-                rate_hz = frame_terms(context.frames or {}).rate_hz
+                rate_hz = context.frames.rate_hz if context.frames is not None else None
                 limits = self._rules.videos
                 return self._processes.run(draw_video_frame, video, frame, outlines, suffix, limits, rate_hz)
             if row.kind == DecodeKind.ARCHIVE:
                 file = SpooledFile.of(read_member(file, frame, self._rules.archives).data)
-            picture = FramePicture(file, context.thermal, context.thermal_range, self._rules.images)
+            picture = FramePicture(file, context.is_thermal, context.thermal_range, self._rules.images)
             return self._processes.run(annotate_frame, picture, outlines, suffix)
 
     def overlay(self, caller: Caller, decode_id: str, suffix: str) -> bytes:

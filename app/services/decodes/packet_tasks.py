@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,16 +20,15 @@ from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.parts import open_parts
 from app.lanes.overlay import LaneOverlay, VehiclePose, lane_in_frame, ned_from_enu
 from app.lanes.smooth_line import plane_from_wgs84
-from app.lanes.types import Lane, LaneMarkers
+from app.lanes.types import Lane, LaneMarkers, LaneRules
 from app.plots.annotated_frame import draw_lane, encode_picture
 from app.plots.lane import SignalPicture, picture_of_lane, plot_lane
 from app.sensors.camera import Camera
 from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.services.decoder_tasks import decoder_task
-from app.services.decodes.declarations import PacketTerms, packet_terms
+from app.services.decodes.declarations import DeclaredPackets
 
-if TYPE_CHECKING:  # they load numba
-    from app.lanes.control import Controller
+if TYPE_CHECKING:  # it loads numba
     from app.simulation.steering import SteeringCheck
 
 _LOG = ("log", "cut the log into shorter ones")
@@ -54,16 +52,12 @@ class DriveFiles:
 def read_drive(
     name: str,
     file: SpooledFile,
-    declared: Mapping[str, object],
+    declared: DeclaredPackets,
     limits: PacketLimits = PacketLimits(),
     images: ImageLimits = ImageLimits(),
 ) -> DriveFiles:
-    """Read the files of a drive: a packet log, or a ZIP of packet logs, poses and a camera frame.
-
-    `declared` is the declaration as it was sent; see `packet_terms`.
-    """
+    """Read the files of a drive: a packet log, or a ZIP of packet logs, poses and a camera frame."""
     began = time.perf_counter()
-    terms = packet_terms(declared)
     packets: list[ReceivedPacket] = []
     track: PoseTrack | None = None
     frame: tuple[str, ImageHeader] | None = None
@@ -73,7 +67,7 @@ def read_drive(
             if part.name.startswith("."):
                 continue  # what a desktop leaves in a ZIP
             data = part.content()
-            kind = terms.files.get(part.name) or detect_drive_file(part.name, data)
+            kind = (declared.files or {}).get(part.name) or detect_drive_file(part.name, data)
             if kind == "frame":
                 if frame is not None:
                     raise _twice("camera frame", part.name)
@@ -82,10 +76,10 @@ def read_drive(
                 if track is not None:
                     raise _twice("track", part.name)
                 with naming("packets"):
-                    track, reports[part.name] = read_poses(part.name, data, terms.poses)
+                    track, reports[part.name] = read_poses(part.name, data, declared.poses)
             else:
                 with naming("packets"):
-                    log = read_packets(part.name, data, terms.packets, limits)
+                    log = read_packets(part.name, data, declared, limits)
                 first = sum(report.entries for read_name, report in reports.items() if read_name != part.name)
                 packets += [replace(packet, entry=packet.entry + first) for packet in log.packets]
                 reports[part.name] = log.report
@@ -142,7 +136,7 @@ def estimate_lane(
     markers: LaneMarkers,
     left_out: tuple[LeftOutMarker, ...],
     track: PoseTrack | None,
-    terms: PacketTerms,
+    declared: DeclaredPackets,
     signals: SignalPicture | None,
     camera: PosedCamera | None,
 ) -> LaneResult:
@@ -150,22 +144,23 @@ def estimate_lane(
     from app.lanes.estimate import fit_lane
 
     began = time.perf_counter()
-    lane = fit_lane(markers, track, method=terms.method, rules=terms.lane)
-    steering = _check_steering(lane, terms.controller)
+    lane = fit_lane(markers, track, method=declared.method, rules=LaneRules.of(declared.lane))
+    steering = _check_steering(lane, declared.steering)
     overlay = _overlay(lane, markers, camera)
     decode_ms = 1e3 * (time.perf_counter() - began)
     return LaneResult(lane, steering, overlay, _plot(lane, markers, left_out, track, signals).encode(), decode_ms)
 
 
-def _check_steering(lane: Lane, controller: Controller | None) -> SteeringCheck | str | None:
-    if controller is None or len(lane.station_m) < 2:
+def _check_steering(lane: Lane, controller: str) -> SteeringCheck | str | None:
+    if controller == "none" or len(lane.station_m) < 2:
         return None
+    from app.lanes.control import Controller
     from app.simulation.steering import check_steering
 
     limit = lane.speed_limit_kmh
     speed = np.where(np.isfinite(limit), limit, np.nanmin(limit) if np.isfinite(limit).any() else _DEFAULT_SPEED_KM_H)
     try:
-        return check_steering(lane.position_enu_m, speed, controller=controller)
+        return check_steering(lane.position_enu_m, speed, controller=Controller(controller))
     except InvalidParameter as error:
         return error.message
 

@@ -23,8 +23,8 @@ from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.registry.markers import CODEBOOKS, book_of
 from app.services.access.agency_secrets import AgencySecrets
-from app.services.decodes.context import DecodeContext, DecodeKind, DecodeRules
-from app.services.decodes.declarations import packet_terms, trace_terms
+from app.services.decodes.context import DecodeKind, DecodeRules
+from app.services.decodes.declarations import DeclaredPackets, DeclaredTrace, DecodeContext
 from app.services.decodes.matching import (
     NearbyTags,
     ReadPackets,
@@ -142,16 +142,14 @@ class TraceHandler(UploadHandler[TraceSignal]):
 
     def start(self, upload: Upload) -> Pending[TraceSignal]:
         """Hand the recording over with the tags that the drive can have passed."""
-        declared = upload.context.trace or {}
-        position, reach_m = upload.context.coarse_position, trace_terms(declared).reach_m
+        declared, position = upload.context.trace or DeclaredTrace(), upload.context.coarse_position
         with self._database.read() as connection:
             epoch = decimal_year(upload.observed_at)
-            nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m, epoch)
+            nearby = find_nearby_tags(connection, upload.agency_id, position, declared.reach_m, epoch)
             formats = () if nearby.texts else _book_formats(connection, upload.agency_id)
-        name = str(declared.get("file_name") or "recording")
         pending = self._processes.submit(
             decode_recording,
-            name,
+            upload.context.file_name or "recording",
             upload.file,
             declared,
             nearby.texts,
@@ -167,11 +165,11 @@ class TraceHandler(UploadHandler[TraceSignal]):
 
     def match(self, connection: sa.Connection, upload: Upload, signal: TraceSignal) -> Decoded:
         """Match the findings against the registered tags."""
-        terms = trace_terms(upload.context.trace or {})
-        trace = match_tags(signal.result.findings, signal.nearby.tags, terms.bar)
+        bar = (upload.context.trace or DeclaredTrace()).sensors
+        trace = match_tags(signal.result.findings, signal.nearby.tags, bar)
         document = trace_document(signal.result, trace, codebook_tags=len(signal.nearby.texts))
         nearby, at = signal.nearby, upload.observed_at
-        missed = missed_tags(trace, nearby.tags, nearby.complete, terms.bar, at)
+        missed = missed_tags(trace, nearby.tags, nearby.complete, bar, at)
         return Decoded(document, [*_observations(trace, at), *missed])
 
 
@@ -253,15 +251,14 @@ class PacketHandler(UploadHandler[DriveSignal]):
         """Have the files of the drive read."""
         if upload.again_id is None:
             self._invalid_tags.left(_holder(upload), upload.received_at)
-        declared = upload.context.packets or {}
-        name = str(declared.get("file_name") or "packets")
+        declared, name = upload.context.packets or DeclaredPackets(), upload.context.file_name or "packets"
         packets, images = self._rules.packets, self._rules.images
         files = self._processes.submit(read_drive, name, upload.file, declared, packets, images, wait_s=upload.wait_s)
         return PendingSignal(files, partial(self._verify, upload))
 
     def _verify(self, upload: Upload, files: DriveFiles) -> DriveSignal:
         """Verify the packets against the registry as it is now, and estimate the lane."""
-        terms = packet_terms(upload.context.packets or {})
+        declared = upload.context.packets or DeclaredPackets()
         with self._database.read() as connection:
             numbers = list_numbers(files.packets)
             known = find_known(connection, upload.agency_id, self._secrets, numbers, upload.again_id)
@@ -269,7 +266,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
         read = read_packets_of(
             files,
             known,
-            terms,
+            declared,
             max_invalid_tags,
             received_at=upload.received_at,
             observed_at=upload.observed_at,
@@ -279,7 +276,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
             lane_markers(read.merged),
             _left_out(read),
             files.track,
-            terms,
+            declared,
             _signals(read),
             _posed_camera(files, upload.context),
             wait_s=upload.wait_s,
@@ -360,9 +357,9 @@ def _left_out(read: ReadPackets) -> tuple[LeftOutMarker, ...]:
 
 def _posed_camera(files: DriveFiles, context: DecodeContext) -> PosedCamera | None:
     """Camera of the frame, and where the vehicle was and pointed when it was taken; None where either is unknown."""
-    if files.frame is None or context.camera is None:
+    camera = context.camera_of(files.frame[1]) if files.frame is not None else None
+    if camera is None:
         return None
-    camera = context.camera.camera_for(files.frame[1])
     track = files.track
     if track is not None and context.captured_at is not None:
         at_s = context.captured_at.timestamp()

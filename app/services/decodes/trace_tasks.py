@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -24,7 +23,7 @@ from app.markers.magnet import MOMENT_AM2, InformationTag, Orientation, parse_ta
 from app.plots.trace import largest_change, plot_trace
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 from app.services.decoder_tasks import decoder_task
-from app.services.decodes.declarations import TRACE_METHODS, TraceTerms, trace_terms
+from app.services.decodes.declarations import DeclaredTrace
 
 Floats = npt.NDArray[np.float64]
 _RECORDING = ("recording", "cut the recording into shorter ones")
@@ -64,7 +63,7 @@ class TraceResult:
 def decode_recording(
     name: str,
     file: SpooledFile,
-    declared: Mapping[str, object],
+    declared: DeclaredTrace,
     tags: tuple[str, ...] = (),
     formats: tuple[TagFormat, ...] = (),
     limits: TraceLimits = TraceLimits(),
@@ -77,8 +76,6 @@ def decode_recording(
         Of the file.
     file : SpooledFile
         A file, or a ZIP of the files of one recording.
-    declared : mapping
-        The declaration as it was sent; see `trace_terms`.
     tags : tuple of str
         Texts of the information tags that are registered nearby.
     formats : tuple of TagFormat
@@ -87,14 +84,13 @@ def decode_recording(
     from app.decoders.magnet.recording_check import find_mistakes
 
     began = time.perf_counter()
-    terms = trace_terms(declared)
     with file.open() as stream:
-        content = read_trace({name: stream}, terms.declaration, limits)
+        content = read_trace({name: stream}, declared, limits)
     loaded = time.perf_counter()
     trace = content.trace
-    findings, version = _decode(trace, terms, tags, formats)
-    if terms.method == TRACE_METHODS[0]:
-        for mistake in find_mistakes(trace, terms.bar, findings):
+    findings, version = _decode(trace, declared, tags, formats)
+    if declared.method == "matched":
+        for mistake in find_mistakes(trace, declared.sensors, findings):
             content.report.warn(mistake.text)
     decoded = time.perf_counter()
     return TraceResult(
@@ -102,7 +98,7 @@ def decode_recording(
         content.report,
         _driven_m(trace),
         version,
-        plot_trace(trace, terms.bar, findings).encode(),
+        plot_trace(trace, declared.sensors, findings).encode(),
         1e3 * (loaded - began),
         1e3 * (decoded - loaded),
         _motion(trace),
@@ -110,18 +106,18 @@ def decode_recording(
 
 
 def _decode(
-    trace: MagnetTrace, terms: TraceTerms, tags: tuple[str, ...], formats: tuple[TagFormat, ...]
+    trace: MagnetTrace, declared: DeclaredTrace, tags: tuple[str, ...], formats: tuple[TagFormat, ...]
 ) -> tuple[list[Finding], str]:
     """Findings, and the decoder's version."""
-    if terms.method == "metro":
+    if declared.method == "metro":
         from app.decoders.magnet import metro  # not loaded before: scipy.signal takes most of a second
 
-        return metro.decode_trace_metro(trace, terms.bar), metro.VERSION
+        return metro.decode_trace_metro(trace, declared.sensors), metro.VERSION
     from app.decoders.magnet.decoder import VERSION, decode_trace
 
     known = [tag for text in tags if isinstance(tag := parse_tag(text), InformationTag)]
-    candidates = TagCandidates(tags=known) if known else TagCandidates(formats=terms.formats or formats)
-    return decode_trace(trace, terms.bar, candidates=candidates), VERSION
+    candidates = TagCandidates(tags=known) if known else TagCandidates(formats=declared.tag_formats or formats)
+    return decode_trace(trace, declared.sensors, candidates=candidates), VERSION
 
 
 def _motion(trace: MagnetTrace) -> TraceMotion:
@@ -172,7 +168,7 @@ def compile_traces() -> None:
 
     tag = parse_tag("SNS_4_0.1_10-30")
     assert isinstance(tag, InformationTag)
-    bar = trace_terms({}).bar
+    bar = MagnetometerBar.metro()
     rng = np.random.default_rng(1)
     t_s = np.arange(0.0, _COMPILED_M / _COMPILED_M_S, _COMPILED_STEP_S)
     travelled_m = _COMPILED_M_S * t_s[:, None] * (1.0, 0.0, 0.0)
@@ -225,7 +221,7 @@ class SamplesDocument(TypedDict):
 def read_samples(
     name: str,
     file: SpooledFile,
-    declared: Mapping[str, object],
+    declared: DeclaredTrace,
     series: tuple[str, ...],
     from_s: float | None,
     to_s: float | None,
@@ -237,9 +233,8 @@ def read_samples(
     The series ``vertical`` and ``forward`` are the largest change on any sensor of the array, ``s3_x`` is an axis of a
     sensor. Without times, the samples are those of the whole recording.
     """
-    terms = trace_terms(declared)
     with file.open() as stream:
-        trace = read_trace({name: stream}, terms.declaration, limits).trace
+        trace = read_trace({name: stream}, declared, limits).trace
     available = [*_DERIVED, *(f"s{k + 1}_{axis}" for k in range(trace.field_ut.shape[1]) for axis in _AXES)]
     unknown = next((name for name in series if name not in available), None)
     if unknown is not None:
@@ -254,7 +249,7 @@ def read_samples(
     first, end = np.searchsorted(trace.t_s, from_s, "left"), np.searchsorted(trace.t_s, to_s, "right")
     t_s = trace.t_s[first:end]
     starts = _groups(len(t_s), points)
-    values = [_series(trace, terms.bar, name)[first:end] for name in series]
+    values = [_series(trace, declared.sensors, name)[first:end] for name in series]
     return {
         "series": [
             {"name": name, "values": _listed(chosen if starts is None else _extremes(chosen, starts))}

@@ -29,7 +29,8 @@ from app.registry.health import NewUnregistered, add_unregistered
 from app.registry.jobs import JobKind, new_job
 from app.services.access.access import Caller
 from app.services.blobs import StagedBlobs, staged
-from app.services.decodes.context import DecodeContext, DecodeKind
+from app.services.decodes.context import DecodeKind
+from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.documents import DecodeDocument, decode_document
 from app.services.decodes.frame_documents import FramesResult
 from app.services.decodes.packet_documents import PacketsResult
@@ -342,7 +343,7 @@ def _store_findings(connection: sa.Connection, upload: Upload, decode_id: str, d
     store.add_observations(connection, upload.agency_id, decode_id, decoded.observations)
     add_unregistered(connection, upload.agency_id, decode_id, decoded.unregistered)
     context = upload.context
-    vehicle = context.vehicle["id"] if context.vehicle else upload.author.key_id or ""
+    vehicle = context.vehicle.id if context.vehicle else upload.author.key_id or ""
     sensor = BAR if context.trace is not None else RADIO if context.packets is not None else CAMERA
     drive = ObservedDrive(decode_id, sensor, vehicle, decoded.observations, decoded.unregistered)
     record_drive(connection, upload.agency_id, drive, now)

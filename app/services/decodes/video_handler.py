@@ -25,8 +25,8 @@ from app.formats.video_file import (
 )
 from app.registry.database import Database
 from app.registry.spatial import distance_m
-from app.services.decodes.context import MAX_ACCURACY_M, CoarsePosition, DecodeContext, DecodeKind, DecodeRules
-from app.services.decodes.declarations import frame_terms
+from app.services.decodes.context import DecodeKind, DecodeRules
+from app.services.decodes.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.services.decodes.frame_documents import (
     DriveNotes,
     ReadFrame,
@@ -155,17 +155,17 @@ class PendingVideo:
 
     def _index(self) -> VideoIndex:
         upload, wait_s = self._upload, self._upload.wait_s
-        context, terms = upload.context, frame_terms(upload.context.frames or {})
+        context, declared = upload.context, upload.context.frames or DeclaredFrames()
         kind = _kind_of(context, upload.file)
         if kind is None:
             packed = open_packed_video(upload.file, self._rules.archives)
             video = packed.video
             if packed.beside:
-                lists = self._processes.run(read_frame_lists, packed.beside, terms.poses, wait_s=wait_s)
+                lists = self._processes.run(read_frame_lists, packed.beside, declared.track, wait_s=wait_s)
                 self._places = FramePlaces(context, lists)
         else:
             video = VideoFile(upload.file, kind)
-        index = self._processes.run(index_frames, video, self._rules.videos, terms.rate_hz, wait_s=wait_s)
+        index = self._processes.run(index_frames, video, self._rules.videos, declared.rate_hz, wait_s=wait_s)
         self._signal.warnings += index.warnings
         self._signal.gaps += [
             {
@@ -199,13 +199,13 @@ class PendingVideo:
         camera = None
         if setup is not None:
             size = setup.width_px or index.width_px, setup.height_px or index.height_px
-            camera = setup.camera_for(_header(*size))
+            camera = setup.camera_of(*size)
         pending = self._processes.submit(
             decode_segment,
             index,
             number,
             search_for(nearby, camera),
-            self._upload.context.thermal,
+            self._upload.context.is_thermal,
             tuple((at, pose.speed_m_s) for at, pose in poses if pose.speed_m_s is not None),
             wait_s=self._upload.wait_s,
         )
@@ -271,7 +271,7 @@ class PendingVideo:
 
 
 def _kind_of(context: DecodeContext, file: SpooledFile) -> VideoKind | None:
-    is_stream = (context.frames or {}).get("rate_hz") is not None
+    is_stream = context.frames is not None and context.frames.rate_hz is not None
     return detect_video(file.head(), is_stream=is_stream)
 
 
@@ -294,7 +294,7 @@ def _around(poses: Iterator[FramePose]) -> CoarsePosition | None:
     radius_m = max(
         distance_m(middle.lon_deg, middle.lat_deg, pose.lon_deg, pose.lat_deg) + pose.radius_m for pose in listed
     )
-    return CoarsePosition(middle.lon_deg, middle.lat_deg, min(radius_m, MAX_ACCURACY_M))
+    return CoarsePosition(lon_deg=middle.lon_deg, lat_deg=middle.lat_deg, accuracy_m=min(radius_m, MAX_ACCURACY_M))
 
 
 def _within_reach(nearby: NearbyMarkers, position: CoarsePosition | None) -> NearbyMarkers:

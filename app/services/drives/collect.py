@@ -6,15 +6,18 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from app.errors import Conflict, InvalidParameter
 from app.geodesy import LocalizationGrade
+from app.inputs import Declaration, Identifier, Number, Text
 from app.registry.decodes import DecodeRow
 from app.services.decodes.context import DecodeKind
 from app.tracks import Clock, LanePath, LeftOutReason, PositionFix, Samples, TrackInput
+from app.tracks.types import MAX_CLOCK_SIGMA_S
 
 SPEED_SIGMA_M_S = 0.1
 """Noise of a vehicle's speed besides its scale. [m/s] A count of a wheel in 0.1 s is 5 cm."""
@@ -28,15 +31,22 @@ _EPOCH_S = 1e9  # times beyond are seconds since 1970: no recording lasts 30 yea
 _IN_USE = ("active", "surveyed", "built")
 
 
-@dataclass(frozen=True, slots=True)
-class DecodeClock:
-    """A decode of a drive, and what is declared of its clock."""
+class DriveDecode(Declaration):
+    """A decode of a drive, and its sensor's clock."""
 
-    decode_id: str
-    clock: str  # its name; decodes with the same name share a clock
-    # `offset_s`, `sigma_s`: [s] what is to be added to its times, and how far that may be off
-    offset_s: float = 0.0
-    sigma_s: float = DEFAULT_CLOCK_SIGMA_S
+    id: Identifier
+    clock: Annotated[Text, Field(min_length=1, max_length=80)] | None = Field(
+        None, description="Name of the clock; decodes with the same name share one. Without it, each has its own."
+    )
+    offset_s: Number = Field(
+        0.0, ge=-1e7, le=1e7, description="To be added to the times of the decode, where the clock was set wrong. [s]"
+    )
+    clock_sigma_s: Number = Field(
+        DEFAULT_CLOCK_SIGMA_S,
+        ge=0,
+        le=MAX_CLOCK_SIGMA_S,
+        description="How far the clock may be off; 0: it is exact, no offset is estimated. [s]",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +85,7 @@ class Collected:
         return TrackInput(clocks, fixes, tuple(self.speeds), tuple(self.headings), tuple(self.paths))
 
 
-def collect(rows: Sequence[tuple[DecodeClock, DecodeRow]], *, use_unfit: bool) -> Collected:
+def collect(rows: Sequence[tuple[DriveDecode, DecodeRow]], *, use_unfit: bool) -> Collected:
     """All that the results of finished decodes hold.
 
     Parameters
@@ -100,20 +110,20 @@ def collect(rows: Sequence[tuple[DecodeClock, DecodeRow]], *, use_unfit: bool) -
                 limit="decodes that are done",
                 cure="wait for it" if row.state in ("queued", "running") else "upload it again, or leave it out",
             )
-        clock = Clock(declared.clock, declared.offset_s, declared.sigma_s)
-        if found.clocks.setdefault(declared.clock, clock) != clock:
+        clock = Clock(declared.clock or declared.id, declared.offset_s, declared.clock_sigma_s)
+        if found.clocks.setdefault(clock.name, clock) != clock:
             raise InvalidParameter(
-                f"the clock {declared.clock} is declared in two ways",
+                f"the clock {clock.name} is declared in two ways",
                 field=f"{where}.offset_s",
                 limit="one offset_s and clock_sigma_s for a clock",
                 cure="give the clocks different names, or declare the same",
             )
         if row.kind == DecodeKind.TRACE:
-            _add_trace(found, row, declared.clock, where, use_unfit)
+            _add_trace(found, row, clock.name, where, use_unfit)
         elif row.kind == DecodeKind.PACKETS:
             _add_packets(found, row)
         else:
-            _add_frames(found, row, declared.clock, where, use_unfit)
+            _add_frames(found, row, clock.name, where, use_unfit)
         _add_positions(found, row, clock)
     return found
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from datetime import timedelta
+from typing import Annotated
 
 import sqlalchemy as sa
+from pydantic import ConfigDict, Field, model_validator
 
 from app.errors import Conflict, InvalidParameter, NotFound
+from app.inputs import Declaration, Flag, Text
 from app.registry import decodes as decode_store
 from app.registry import jobs as store
 from app.registry.column_types import new_id
@@ -20,7 +22,7 @@ from app.registry.markers import find_markers
 from app.services.access.access import Caller
 from app.services.blobs import delete_unused, staged
 from app.services.decodes.matching import horizontal_rmse_m
-from app.services.drives.collect import Collected, DecodeClock, collect
+from app.services.drives.collect import Collected, DriveDecode, collect
 from app.services.drives.documents import DrivePage, TrackedDriveDocument, drive_document, drive_head
 from app.services.drives.tasks import write_track
 from app.services.fleet.vehicles import find_vehicle
@@ -37,15 +39,44 @@ _WAIT_S = 60.0
 _COLLECTED, _WRITTEN = 0.1, 0.9
 
 
-@dataclass(frozen=True, slots=True)
-class NewDrive:
-    """A drive to make."""
+class DriveOptions(TrackRules):
+    """How the track is estimated, and from what."""
 
-    decodes: tuple[DecodeClock, ...]
-    name: str | None
-    vehicle: str | None  # name or id
-    rules: TrackRules
-    use_unfit: bool  # use positions that are not for localization, too
+    use_unfit: Flag = Field(False, description="Use positions that are not for localization, too.")
+
+
+class NewDrive(Declaration):
+    """A drive to make of decodes that are done."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "L 560, Monday morning",
+                    "decodes": [
+                        {"id": "019cb624-0000-7000-8000-0000000000aa", "clock": "bar", "clock_sigma_s": 0.1},
+                        {"id": "019cb624-0000-7000-8000-0000000000ab", "clock": "camera", "offset_s": -0.2},
+                    ],
+                    "options": {"rate_hz": 5, "max_sigma_m": 1.0},
+                }
+            ]
+        }
+    )
+
+    name: Annotated[Text, Field(min_length=1, max_length=80)] | None = None
+    vehicle: Annotated[Text, Field(max_length=80)] | None = Field(None, description="Name or id of the vehicle.")
+    decodes: tuple[DriveDecode, ...] = Field(min_length=1, max_length=MAX_DECODES)
+    options: DriveOptions = DriveOptions()
+
+    @model_validator(mode="after")
+    def _each_decode_once(self) -> NewDrive:
+        ids = [entry.id for entry in self.decodes]
+        twice = next((k for k, name in enumerate(ids) if name in ids[:k]), None)
+        if twice is not None:
+            raise InvalidParameter(
+                f"decode {ids[twice]} is named twice", field=f"decodes.{twice}.id", limit="each decode once"
+            )
+        return self
 
 
 class Drives:
@@ -82,16 +113,11 @@ class Drives:
         with self._database.read() as connection:
             rows = _decodes(connection, caller.agency_id, drive.decodes, caller.own_key_id)
             vehicle_id = _vehicle(connection, caller, drive.vehicle, rows)
-        found = collect(rows, use_unfit=drive.use_unfit)
+        found = collect(rows, use_unfit=drive.options.use_unfit)
         if not found.fixes:
             raise _nothing(rows)
         check_times(found.track_input({}))
-        job_input = {
-            "name": drive.name,
-            "decodes": [asdict(entry) for entry in drive.decodes],
-            "options": {**asdict(drive.rules), "use_unfit": drive.use_unfit},
-            "label": caller.label,
-        }
+        job_input = {**drive.model_dump(mode="json", exclude={"vehicle"}), "label": caller.label}
         job = new_job(
             JobKind.DRIVE, new_id(now), agency_id, caller.key_id, now, job_input=job_input, subject_id=vehicle_id
         )
@@ -105,19 +131,18 @@ class Drives:
 
     def run(self, job: RunningJob) -> None:
         """Estimate the track of a drive; the handler of jobs of the kind `JobKind.DRIVE`."""
-        given, agency_id = job.row.input, job.row.agency_id
-        options = dict(given["options"])
-        use_unfit = bool(options.pop("use_unfit"))
-        clocks = tuple(DecodeClock(**entry) for entry in given["decodes"])
+        agency_id = job.row.agency_id
+        drive = NewDrive.model_validate({name: job.row.input[name] for name in ("name", "decodes", "options")})
         with self._database.read() as connection:
-            found = collect(_decodes(connection, agency_id, clocks, None), use_unfit=use_unfit)
+            rows = _decodes(connection, agency_id, drive.decodes, None)
+            found = collect(rows, use_unfit=drive.options.use_unfit)
             survey = _survey_m2(connection, agency_id, found)
         job.report_progress(_COLLECTED)
         written = self._processes.run(
             write_track,
-            given["name"] or f"drive {job.row.id}",
+            drive.name or f"drive {job.row.id}",
             found.track_input(survey),
-            TrackRules(**options),
+            drive.options,
             tuple(found.left_out),
             tuple(found.on_lane),
             tuple(found.warnings),
@@ -204,12 +229,12 @@ class Drives:
 
 
 def _decodes(
-    connection: sa.Connection, agency_id: str, clocks: Sequence[DecodeClock], holder_id: str | None
-) -> list[tuple[DecodeClock, DecodeRow]]:
+    connection: sa.Connection, agency_id: str, declared: Sequence[DriveDecode], holder_id: str | None
+) -> list[tuple[DriveDecode, DecodeRow]]:
     rows = []
-    for k, entry in enumerate(clocks):
+    for k, entry in enumerate(declared):
         try:
-            row = decode_store.get_decode(connection, agency_id, entry.decode_id, holder_id=holder_id)
+            row = decode_store.get_decode(connection, agency_id, entry.id, holder_id=holder_id)
         except NotFound as error:
             error.field = f"decodes.{k}.id"
             raise
@@ -218,7 +243,7 @@ def _decodes(
 
 
 def _vehicle(
-    connection: sa.Connection, caller: Caller, named: str | None, rows: Sequence[tuple[DecodeClock, DecodeRow]]
+    connection: sa.Connection, caller: Caller, named: str | None, rows: Sequence[tuple[DriveDecode, DecodeRow]]
 ) -> str | None:
     """Id of the vehicle that drove.
 
@@ -255,7 +280,7 @@ def _survey_m2(connection: sa.Connection, agency_id: str, found: Collected) -> d
     return variances
 
 
-def _nothing(rows: Sequence[tuple[DecodeClock, DecodeRow]]) -> InvalidParameter:
+def _nothing(rows: Sequence[tuple[DriveDecode, DecodeRow]]) -> InvalidParameter:
     found = collect(rows, use_unfit=True)
     cure = "register the markers that were passed with their accuracy, and decode with coarse_position"
     if found.fixes:

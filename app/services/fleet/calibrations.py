@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from datetime import timedelta
+from typing import Literal
+
+from pydantic import ConfigDict, Field, JsonValue
 
 from app import __version__
 from app.calibration.board_view import CameraCalibration, ViewReport
-from app.calibration.calibrate import COEFFICIENTS, VERSION
-from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
+from app.calibration.calibrate import VERSION
+from app.errors import UnreadableUpload, UploadTooLarge
 from app.formats.format import SpooledFile
 from app.formats.images import ImageLimits
+from app.inputs import Declaration
 from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.vehicles import CALIBRATIONS, CalibrationRow
@@ -31,6 +35,18 @@ from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.ports import Clock, DecoderProcesses
 
 _BUSY_WAIT_S = 10.0
+DECLARATION_EXAMPLE: dict[str, JsonValue] = {
+    "board": {"columns": 7, "rows": 10, "square_mm": 25.0, "marker_mm": 18.0},
+}
+
+
+class CalibrationDeclaration(Declaration):
+    """What is declared of the photos."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [DECLARATION_EXAMPLE]})
+
+    board: CalibrationBoard = CalibrationBoard()
+    coefficients: Literal[4, 5, 8] | None = Field(None, description="Of the distortion; chosen if left out.")
 
 
 class Calibrations:
@@ -60,8 +76,7 @@ class Calibrations:
         self,
         caller: Caller,
         photos: tuple[tuple[str, SpooledFile], ...],
-        board: CalibrationBoard,
-        coefficients: int | None = None,
+        declared: CalibrationDeclaration,
         key: IdempotencyKey | None = None,
     ) -> tuple[CalibrationDocument, bool]:
         """Calibrate a camera. The photos are not kept.
@@ -84,9 +99,8 @@ class Calibrations:
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
-        if coefficients is not None and coefficients not in COEFFICIENTS:
-            raise InvalidParameter(f"{coefficients} coefficients", field="coefficients", limit="4, 5 or 8")
         _check_count(photos)
+        board, coefficients = declared.board, declared.coefficients
         found = self._processes.run(calibrate_photos, photos, board, coefficients, self._images, wait_s=_BUSY_WAIT_S)
         result = calibration_result(found, board)
         row = CalibrationRow(id=new_id(now), who=caller.label, result=result, created_at=now)

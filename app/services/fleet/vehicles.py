@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any
 
 import sqlalchemy as sa
+from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
 from app.errors import Conflict, InvalidParameter, NotAllowed, NotFound, naming
 from app.formats.format import SpooledFile
 from app.formats.kinds import UploadKind, guess_kind
+from app.inputs import Declaration, Identifier, Text, parse_input
 from app.registry import vehicles as store
 from app.registry.database import Database
 from app.registry.resources import first_version
 from app.registry.spatial import distance_m
 from app.registry.vehicles import CALIBRATIONS, VEHICLES, VehicleKeyRow, VehicleRow
+from app.sensors.camera import INTRINSICS, CameraDeclaration
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
-from app.services.decodes.context import CameraSetup, ContextInput, DecodeContext, context_from_document
-from app.services.decodes.declarations import packet_terms, trace_terms
+from app.services.decodes.declarations import DecodeContext, Profile, UploadContext
 from app.services.documents import document_of
 from app.services.fleet.documents import (
     VehicleDocument,
     VehicleKey,
     VehiclePage,
+    VehicleStatus,
     VehicleVersionDocument,
     VehicleVersionPage,
 )
@@ -35,7 +37,6 @@ from app.services.ports import Clock
 
 # === Sensor profiles: the part of a decode's context that stays the same from upload to upload.
 #
-# A profile has the members of the context (`camera`, `thermal`, `thermal_range`, `trace`, `packets`) and their names.
 # What an upload states itself goes before its vehicle's profile, member by member.
 
 
@@ -47,68 +48,77 @@ SECTIONS = {
     TRACE: ("trace",),
     PACKETS: ("packets", "camera"),
 }
-INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 _SIZE = ("width_px", "height_px")
-_OF_THE_SIZE = (*INTRINSICS, "distortion")
-_PROFILE_ONLY = ("calibration_id",)
-"""What a vehicle's camera has and a context's has not."""
+_CALIBRATED = (*_SIZE, *INTRINSICS, "distortion")
+"""What a calibration puts into a camera, and another calibration or field of view invalidates."""
 _WHOLE = ("trace.can.speed", "trace.can.heading")
 """Objects that are replaced as a whole: a signal by its name and one by its bits declare the same thing."""
+PROFILE_EXAMPLE: dict[str, JsonValue] = {
+    "camera": {
+        "width_px": 1920, "height_px": 1080, "fx_px": 1371.0, "fy_px": 1371.0, "cx_px": 959.5, "cy_px": 539.5,
+        "height_m": 1.57, "depression_deg": 23.0, "forward_m": 1.2,
+    },
+    "trace": {"axes": "FRD", "unit": "uT", "bar": {"forward_m": 0.4}, "rate_hz": 350.0},
+    "packets": {
+        "receiver": {"sensitivity_dbm": -129.0, "antenna_height_m": 1.6},
+        "poses": {"forward_m": 0.9, "left_m": 0.0, "accuracy_m": 0.5},
+    },
+}  # fmt: skip
 
 Object = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Inherited:
-    """A context after its vehicle's profile was put behind it."""
+class VehicleCamera(CameraDeclaration):
+    """A vehicle's camera: that of a context; intrinsics may come later, from a calibration."""
 
-    context: Object  # as `DecodeContext.document` writes it, without what is nobody's
-    sources: dict[str, str]  # path of each member to ``upload``, ``vehicle`` or ``default``
+    calibration_id: Identifier | None = Field(None, description="Calibration that the intrinsics are of.")
 
 
-def check_profile(profile: Mapping[str, Any]) -> None:
-    """Refuse a profile that no upload could use.
+class VehicleProfile(Profile):
+    """What stays the same from upload to upload, in the members of a decode's context."""
 
-    Raises
-    ------
-    InvalidParameter
-        The field is below ``profile``.
-    """
-    with naming("profile"):
-        camera = context_camera(profile.get("camera"))
-        if camera is not None:
-            # the mount alone is allowed: intrinsics can come from a calibration later
-            known = camera if has_intrinsics(camera) else {**camera, "horizontal_fov_deg": 60.0}
-            CameraSetup(**{**known, "distortion": tuple(known.get("distortion", ()))})
-        counts = profile.get("thermal_range")
-        DecodeContext(thermal=profile.get("thermal", False), thermal_range=(counts[0], counts[1]) if counts else None)
-        if profile.get("trace") is not None:
-            trace_terms(profile["trace"])
-        if profile.get("packets") is not None:
-            packet_terms(profile["packets"])
+    model_config = ConfigDict(json_schema_extra={"examples": [PROFILE_EXAMPLE]})
 
+    camera: VehicleCamera | None = None
 
-def has_intrinsics(camera: Mapping[str, object]) -> bool:
-    """Whether a camera states its projection, completely or in part."""
-    return any(camera.get(name) is not None for name in (*INTRINSICS, "horizontal_fov_deg"))
+    def check(self) -> None:
+        """Refuse a profile that no upload could use; a camera may be its mount alone.
 
+        Raises
+        ------
+        InvalidParameter
+            The field is below ``profile``.
+        """
+        usable = self
+        if self.camera is not None and not self.camera.has_projection:
+            camera = self.camera.model_copy(update={"horizontal_fov_deg": 60.0})
+            usable = self.model_copy(update={"camera": camera})
+        with naming("profile"):
+            Profile.check(usable)
 
-def context_camera(camera: Mapping[str, object] | None) -> Object | None:
-    """A vehicle's camera as a context has it."""
-    if camera is None:
-        return None
-    return {name: value for name, value in camera.items() if name not in _PROFILE_ONLY}
+    def document(self) -> Object:
+        """The profile as it is stored: the members that have a value."""
+        return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
 
-def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) -> Inherited:
+def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) -> tuple[Object, dict[str, str]]:
     """Complete what an upload states from the vehicle's profile.
 
     Parameters
     ----------
+    profile : mapping
+        As it is stored.
     stated : mapping
         Only what the upload states; a member that is None is unknown and is not inherited.
     kind : str
         ``frame``, ``trace`` or ``packets``: sections of other kinds are ignored.
+
+    Returns
+    -------
+    context : dict
+        The members of a `DecodeContext`.
+    sources : dict
+        Path of each member to ``upload``, ``vehicle`` or ``default``.
 
     Raises
     ------
@@ -116,35 +126,37 @@ def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) ->
         The profile's intrinsics belong to another frame size than the upload states.
     """
     ours = {name: profile[name] for name in SECTIONS[kind] if name in profile}
-    stated_members = {name: value for name, value in stated.items() if value is not None or name not in NEEDED}
+    stated = {name: value for name, value in stated.items() if value is not None or name not in NEEDED}
     if "camera" in ours:
-        ours["camera"] = _fitting_camera(context_camera(ours["camera"]) or {}, stated_members.get("camera", {}))
-        if kind != FRAME and not has_intrinsics({**ours["camera"], **(stated_members.get("camera") or {})}):
+        ours["camera"] = _fitting_camera(ours["camera"], stated.get("camera") or {})
+        if kind != FRAME and not _has_projection({**ours["camera"], **(stated.get("camera") or {})}):
             del ours["camera"]  # a mount without a projection cannot draw over a frame
-    if stated_members.get("thermal") is False:
+    if stated.get("thermal") is False:
         ours.pop("thermal_range", None)
     sources: dict[str, str] = {}
-    context = _merge(ours, stated_members, sources)
-    if isinstance(context.get("camera"), dict):
-        for entry in fields(CameraSetup):
-            if entry.default is not None and entry.name not in context["camera"] and entry.name != "distortion":
-                sources[f"camera.{entry.name}"] = "default"
-    return Inherited(context, dict(sorted(sources.items())))
+    context = _merge(ours, stated, sources)
+    if (camera := context.get("camera")) is not None:
+        for name, member in CameraDeclaration.model_fields.items():
+            if name not in camera and member.default not in (None, ()):
+                camera[name], sources[f"camera.{name}"] = member.default, "default"
+    return context, dict(sorted(sources.items()))
 
 
-def _fitting_camera(camera: Object, stated: object) -> Object:
-    """A profile's camera without the members that the upload's camera invalidates."""
-    if not isinstance(stated, Mapping):
-        return camera
-    given = {name for name, value in stated.items() if value is not None}
-    if "horizontal_fov_deg" in given:
-        return {name: value for name, value in camera.items() if name not in (*_OF_THE_SIZE, *_SIZE)}
-    if given & set(INTRINSICS):
-        camera = {name: value for name, value in camera.items() if name != "horizontal_fov_deg"}
-    if set(INTRINSICS) <= given:
-        return {name: value for name, value in camera.items() if name not in (*_OF_THE_SIZE, *_SIZE)}
+def _has_projection(camera: Mapping[str, object]) -> bool:
+    return any(camera.get(name) is not None for name in (*INTRINSICS, "horizontal_fov_deg"))
+
+
+def _fitting_camera(camera: Object, stated: Mapping[str, object]) -> Object:
+    """A profile's camera without its calibration's id and the members that the upload's camera invalidates."""
+    known = {name for name, value in stated.items() if value is not None}
+    dropped = {"calibration_id"}
+    if "horizontal_fov_deg" in known or set(INTRINSICS) <= known:
+        dropped |= set(_CALIBRATED)
+    if known & set(INTRINSICS):
+        dropped.add("horizontal_fov_deg")
+    camera = {name: value for name, value in camera.items() if name not in dropped}
     for name in _SIZE:
-        if name in given and camera.get(INTRINSICS[0]) is not None and stated[name] != camera.get(name):
+        if name in known and camera.get(INTRINSICS[0]) is not None and stated[name] != camera.get(name):
             raise InvalidParameter(
                 f"the vehicle's camera was calibrated at {camera.get('width_px')} x {camera.get('height_px')} px, "
                 f"the upload states {name} {stated[name]}",
@@ -155,46 +167,66 @@ def _fitting_camera(camera: Object, stated: object) -> Object:
     return camera
 
 
-def _merge(
-    ours: Mapping[str, object], stated_members: Mapping[str, object], sources: dict[str, str], path: str = ""
-) -> Object:
+def _merge(ours: Object, stated: Mapping[str, Any], sources: dict[str, str], path: str = "") -> Object:
     merged: Object = {}
-    for name in [*ours, *(name for name in stated_members if name not in ours)]:
-        at = f"{path}{name}"
-        theirs, own = stated_members.get(name), ours.get(name)
-        if name in stated_members and theirs is None:
+    for name in {**ours, **stated}:
+        at, is_stated = f"{path}{name}", name in stated
+        own, value = ours.get(name), stated[name] if is_stated else ours[name]
+        if value is None:
             continue  # stated to be unknown
-        if isinstance(theirs if name in stated_members else own, Mapping) and at not in _WHOLE:
-            merged[name] = _merge(
-                own if isinstance(own, Mapping) else {},
-                theirs if isinstance(theirs, Mapping) else {},
-                sources,
-                f"{at}.",
-            )
+        if isinstance(value, dict) and at not in _WHOLE:
+            part = own if isinstance(own, dict) else {}
+            merged[name] = _merge(part, value if is_stated else {}, sources, f"{at}.")
             continue
-        value = theirs if name in stated_members else own
-        merged[name] = {k: v for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
-        sources[at] = "upload" if name in stated_members else "vehicle"
+        merged[name] = {k: v for k, v in value.items() if v is not None} if isinstance(value, dict) else value
+        sources[at] = "upload" if is_stated else "vehicle"
     return merged
 
 
 # === Vehicles of a fleet.
 
 
-ACTIVE, RETIRED = "active", "retired"
+ACTIVE: VehicleStatus = "active"
+RETIRED: VehicleStatus = "retired"
 MAX_KEYS = 20
-_CALIBRATED = ("width_px", "height_px", *INTRINSICS, "distortion")
-"""What a calibration puts into a camera."""
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleChange:
-    """What to change of a vehicle."""
+def _check_name(name: str) -> str:
+    if name != name.strip() or not name.isprintable() or (len(name) == 36 and name.count("-") == 4):
+        raise InvalidParameter(
+            "a vehicle's name is printable, does not begin or end with a space, and is no id",
+            limit="1 to 80 printable characters",
+            cure="send a fleet number or a plate, e.g. BUS-7",
+        )
+    return name
 
-    values: dict[str, Any] = field(default_factory=dict)  # of name, status and note; what is not in it stays
-    # sections to replace, each as a whole; a section that is None is taken out
-    profile: dict[str, object] = field(default_factory=dict)
-    reason: str | None = None
+
+VehicleName = Annotated[Text, Field(min_length=1, max_length=80), AfterValidator(_check_name)]
+Note = Annotated[Text, Field(max_length=500)]
+
+
+class NewVehicle(Declaration):
+    """A vehicle of the fleet."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"name": "BUS-7", "profile": PROFILE_EXAMPLE}]})
+
+    name: VehicleName = Field(description="What uploads call it; each name once in an agency.")
+    note: Note | None = Field(None, description="Make, number plate, whatever distinguishes it.")
+    profile: VehicleProfile = VehicleProfile()
+
+
+class VehicleChange(Declaration):
+    """Members to change. A section of the profile is replaced as a whole; one that is null is taken out."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"profile": {"trace": {"axes": "FRD", "unit": "uT"}}, "reason": "new bar"}]},
+    )
+
+    name: VehicleName = Field("", description="New name.")
+    status: VehicleStatus = Field(ACTIVE, description="A retired vehicle's uploads are refused.")
+    note: Note | None = Field(None, description="New note; null clears it.")
+    profile: VehicleProfile = VehicleProfile()
+    reason: Note | None = Field(None, description="Why; appears in the history.")
 
 
 class Vehicles:
@@ -208,9 +240,7 @@ class Vehicles:
     def add(
         self,
         caller: Caller,
-        name: str,
-        profile: dict[str, object],
-        note: str | None = None,
+        vehicle: NewVehicle,
         key: IdempotencyKey | None = None,
     ) -> tuple[VehicleDocument, bool]:
         """Store a new vehicle.
@@ -231,13 +261,14 @@ class Vehicles:
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
-        check_profile(profile)
+        vehicle.profile.check()
+        name, profile = vehicle.name, vehicle.profile.document()
         with write_once(self._database, caller.agency_id, key, now, self._ttl) as (connection, answer):
             if answer.replayed:
                 return answer.response, True
             VEHICLES.check_name(connection, caller.agency_id, name)
             _check_calibrated(connection, caller, profile)
-            values = {**first_version(now), "name": name, "status": ACTIVE, "note": note, "profile": profile}
+            values = {**first_version(now), "name": name, "status": ACTIVE, "note": vehicle.note, "profile": profile}
             row = VEHICLES.add(connection, caller.agency_id, values, who=caller.label)
             document = answer.store(vehicle_document(row))
             log_change(connection, caller, "vehicle.added", now=now, subject=row.id, document=profile)
@@ -282,13 +313,18 @@ class Vehicles:
         now = self._clock()
         with self._database.write() as connection:
             row = VEHICLES.get_at(connection, caller.agency_id, vehicle_id, version)
-            changes = dict(change.values)
+            changes = change.model_dump(include=change.model_fields_set & {"name", "status", "note"})
+            sections = change.profile.model_fields_set if "profile" in change.model_fields_set else set()
+            if not changes and not sections:
+                raise InvalidParameter(
+                    "the patch changes nothing", field="body", limit="at least one member", cure="name what to change"
+                )
             if "name" in changes and changes["name"] != row.name:
                 VEHICLES.check_name(connection, caller.agency_id, changes["name"])
-            if change.profile:
-                merged = {**row.profile, **change.profile}
-                changes["profile"] = {name: section for name, section in merged.items() if section is not None}
-                check_profile(changes["profile"])
+            if sections:
+                kept = {name: section for name, section in row.profile.items() if name not in sections}
+                changes["profile"] = {**kept, **change.profile.document()}
+                parse_input(VehicleProfile, changes["profile"], "profile").check()
                 _check_calibrated(connection, caller, changes["profile"])
             return _changed(connection, caller, row, changes, now, change.reason)
 
@@ -317,7 +353,7 @@ class Vehicles:
             camera = {**row.profile.get("camera", {}), **found, "calibration_id": calibration_id}
             camera.pop("horizontal_fov_deg", None)
             profile = {**row.profile, "camera": camera}
-            check_profile(profile)
+            parse_input(VehicleProfile, profile, "profile").check()
             why = f"calibration {calibration_id}"
             return _changed(connection, caller, row, {"profile": profile}, now, why)
 
@@ -432,7 +468,9 @@ _MIN_BETWEEN_FRAMES_M = 1.0
 _NAMED = {TRACE: "a magnetometer trace", PACKETS: "a packet log"}
 
 
-def resolve_context(connection: sa.Connection, caller: Caller, given: ContextInput, file: SpooledFile) -> DecodeContext:
+def resolve_context(
+    connection: sa.Connection, caller: Caller, stated: UploadContext, file: SpooledFile, name: str
+) -> DecodeContext:
     """The context of an upload: its own members, completed by the profile of its vehicle if it has one.
 
     Raises
@@ -446,22 +484,19 @@ def resolve_context(connection: sa.Connection, caller: Caller, given: ContextInp
     InvalidParameter
         The context contradicts itself or a limit, or the vehicle's profile lacks what this kind of upload needs.
     """
-    vehicle = find_vehicle(connection, caller, given.vehicle)
+    vehicle, members = find_vehicle(connection, caller, stated.vehicle), stated.stated
     if vehicle is None:
-        return _named(context_from_document(inherit({}, given.stated, FRAME).context), given.file_name)
-    kind = _kind(vehicle, given, file)
-    _check_sections(vehicle, given, kind)
-    stated = given.stated
-    if kind != FRAME and stated.get(kind) is None:
-        stated = {**stated, kind: {}}  # its content shows what it is
-    inherited = inherit(vehicle.profile, stated, kind)
-    used = {
-        "id": vehicle.id,
-        "name": vehicle.name,
-        "version": vehicle.version,
-        "sources": inherited.sources,
-    }
-    return _named(context_from_document(inherited.context | {"vehicle": used}), given.file_name)
+        context, _ = inherit({}, members, FRAME)
+    else:
+        kind = _kind(vehicle, members, file, name)
+        _check_sections(vehicle, members, kind)
+        if kind != FRAME and members.get(kind) is None:
+            members[kind] = {}  # its content shows what it is
+        context, sources = inherit(vehicle.profile, members, kind)
+        context["vehicle"] = {"id": vehicle.id, "name": vehicle.name, "version": vehicle.version, "sources": sources}
+    if shown := "".join(sign for sign in name if sign.isprintable())[:120]:
+        context["file_name"] = shown
+    return parse_input(DecodeContext, context)
 
 
 def count_upload(
@@ -469,9 +504,7 @@ def count_upload(
 ) -> None:
     """Count an upload for its vehicle, in the transaction that stores its decode."""
     if context.vehicle is not None:
-        store.add_upload(
-            connection, agency_id, context.vehicle["id"], decode_id, version=context.vehicle["version"], now=now
-        )
+        store.add_upload(connection, agency_id, context.vehicle.id, decode_id, version=context.vehicle.version, now=now)
 
 
 def count_driven(
@@ -529,12 +562,12 @@ def find_vehicle(connection: sa.Connection, caller: Caller, named: str | None) -
     return vehicle
 
 
-def _kind(vehicle: VehicleRow, given: ContextInput, file: SpooledFile) -> str:
+def _kind(vehicle: VehicleRow, stated: Mapping[str, object], file: SpooledFile, name: str) -> str:
     """What a vehicle's upload is: as it states, else by its content, else the only kind that the profile has."""
     for kind in (TRACE, PACKETS):
-        if given.stated.get(kind) is not None:
+        if stated.get(kind) is not None:
             return kind
-    guessed = guess_kind(given.file_name or "upload", file)
+    guessed = guess_kind(name or "upload", file)
     if guessed is not None:
         return str(guessed)
     possible = [kind for kind in _NAMED if kind in vehicle.profile]
@@ -548,9 +581,9 @@ def _kind(vehicle: VehicleRow, given: ContextInput, file: SpooledFile) -> str:
     )
 
 
-def _check_sections(vehicle: VehicleRow, given: ContextInput, kind: str) -> None:
+def _check_sections(vehicle: VehicleRow, stated: Mapping[str, object], kind: str) -> None:
     needed = NEEDED[kind]
-    if given.stated.get(needed) is not None or (kind == FRAME and needed in given.stated):
+    if stated.get(needed) is not None or (kind == FRAME and needed in stated):
         return  # stated in the upload, or stated to be unknown
     section = vehicle.profile.get(needed)
     if section is None:
@@ -560,22 +593,10 @@ def _check_sections(vehicle: VehicleRow, given: ContextInput, kind: str) -> None
             limit=f"a profile with {needed}, or {needed} in the context",
             cure=f"PATCH /v1/vehicles/{vehicle.id} with profile.{needed}",
         )
-    if kind == FRAME and not has_intrinsics(section):
+    if kind == FRAME and not _has_projection(section):
         raise InvalidParameter(
             f"the camera of vehicle {vehicle.name} has a mount and no intrinsics",
             field="vehicle",
             limit="fx_px, fy_px, cx_px, cy_px; or horizontal_fov_deg",
             cure="calibrate it with POST /v1/calibrations, or send them in the context",
         )
-
-
-def _named(context: DecodeContext, name: str) -> DecodeContext:
-    """A context with the name of its file; the suffix of a trace or packet log distinguishes kinds of text files."""
-    if not name:
-        return context
-    if context.trace is not None:
-        return replace(context, trace={**context.trace, "file_name": name[:120]})
-    if context.packets is not None:
-        return replace(context, packets={**context.packets, "file_name": name[:120]})
-    shown = "".join(sign for sign in name if sign.isprintable())[:120]
-    return replace(context, file_name=shown or None)

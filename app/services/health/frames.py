@@ -23,7 +23,7 @@ from app.registry.decodes import NewObservation
 from app.registry.health import NewUnregistered
 from app.registry.marker_rows import MarkerRow
 from app.sensors.camera import Camera
-from app.services.decodes.context import DecodeContext
+from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.frame_documents import ReadFrame, ReadMarker
 from app.services.decodes.matching import horizontal_rmse_m, marker_at
 from app.services.health.record import EVIDENCE, MISSED, FrameHealth, rounded
@@ -79,12 +79,12 @@ class VehicleView:
 def view_of(context: DecodeContext, frame: ReadFrame) -> VehicleView | None:
     """The vehicle's own view of a frame; None if its position, heading or camera are not known well enough."""
     position = context.coarse_position
-    if position is None or context.heading_deg is None or context.camera is None or frame.header is None:
+    camera = context.camera_of(frame.header) if frame.header is not None else None
+    if position is None or context.heading_deg is None or camera is None:
         return None
     sigma_m = position.accuracy_m / SIGMAS_IN_ACCURACY
     if sigma_m > MAX_POSITION_SIGMA_M:
         return None
-    camera = context.camera.camera_for(frame.header)
     return VehicleView(position.lon_deg, position.lat_deg, context.heading_deg, sigma_m, camera)
 
 
@@ -148,9 +148,10 @@ def _reading_evidence(
     if view is not None:
         evidence["expected"] = _expected(row, view)
     pose = marker.reading.pose
-    if pose is not None and context.camera is not None and frame.header is not None:
+    camera = context.camera_of(frame.header) if frame.header is not None else None
+    if pose is not None and camera is not None:
         if row.family == PLATE.name:
-            evidence["reversed"] = _is_reversed(pose, context.camera.camera_for(frame.header))
+            evidence["reversed"] = _is_reversed(pose, camera)
         if view is not None:
             evidence |= _offset(pose, row, view, at)
     grade = getattr(marker.reading, "grade", None)

@@ -34,7 +34,7 @@ from app.registry.engines import across_agencies, acting_for
 from app.registry.uploads import PartRow, UploadRow
 from app.services.access.access import Caller, Scope
 from app.services.blobs import delete_unused, staged
-from app.services.decodes.context import ContextInput
+from app.services.decodes.declarations import UploadContext
 from app.services.decodes.decodes import Decodes
 from app.services.decodes.upload_path import UPLOADS
 from app.services.documents import error_document
@@ -88,7 +88,7 @@ class Uploads:
     # --- for clients --------------------------------------------------------------------------------------------------
 
     def create(
-        self, caller: Caller, length: int, context: ContextInput, *, method: str = "tus",
+        self, caller: Caller, length: int, context: UploadContext, name: str, *, method: str = "tus",
         store_key: str | None = None, store_upload_id: str | None = None,
     ) -> UploadDocument:  # fmt: skip
         """Start an upload.
@@ -100,7 +100,7 @@ class Uploads:
         """
         check_length(length, self.rules.max_bytes)
         now = self._clock()
-        declared = {"file_name": context.file_name, "context": context.stated, "vehicle": context.vehicle}
+        declared = {"file_name": name, "context": context.stated, "vehicle": context.vehicle}
         row = UploadRow(
             new_id(now), caller.agency_id, caller.key_id, caller.label, caller.scope, method, "open", length, 0,
             declared, now, now + self.rules.expiry, store_key=store_key, store_upload_id=store_upload_id,
@@ -110,7 +110,9 @@ class Uploads:
             store.add_upload(connection, row)
         return upload_document(row)
 
-    def create_parts(self, caller: Caller, length: int, context: ContextInput) -> tuple[UploadDocument, list[str]]:
+    def create_parts(
+        self, caller: Caller, length: int, context: UploadContext, name: str
+    ) -> tuple[UploadDocument, list[str]]:
         """Start an upload whose parts go to S3 directly; returns it with the URLs of its parts.
 
         Raises
@@ -124,7 +126,7 @@ class Uploads:
         key = new_blob_key(UPLOADS)
         s3_id = self._s3.start(key)
         try:
-            made = self.create(caller, length, context, method="s3-parts", store_key=key, store_upload_id=s3_id)
+            made = self.create(caller, length, context, name, method="s3-parts", store_key=key, store_upload_id=s3_id)
         except BaseException:
             self._s3.abort(key, s3_id)
             raise
@@ -280,11 +282,13 @@ class Uploads:
         caller = Caller(row.agency_id, row.holder_id, row.label, Scope(row.scope))
         keys = self._part_keys(row)
         declared = row.declared
-        context = ContextInput(declared["context"], declared["vehicle"], declared["file_name"])
+        context = UploadContext.model_validate({**declared["context"], "vehicle": declared["vehicle"]})
         key = IdempotencyKey(f"upload {row.id}", row.id, "")
         try:
             with self._composed(row, keys) as file:
-                decode, _replayed = self._decodes.decode_upload(caller, file, context, key, as_job=True)
+                decode, _replayed = self._decodes.decode_upload(
+                    caller, file, context, key, name=declared["file_name"], as_job=True
+                )
         except Unavailable:
             self.end(grant)
             raise

@@ -2692,13 +2692,13 @@ export interface components {
             head: components["schemas"]["AuditHead"] | null;
             items: components["schemas"]["AuditEntryDocument"][];
         };
-        BarIn: {
+        BarDeclaration: {
             /** @default null */
             clearance_m?: number | null;
             /** @default 0 */
             forward_m?: number;
             /** @default null */
-            sensors?: components["schemas"]["SensorIn"][] | null;
+            sensors?: components["schemas"]["SensorDeclaration"][] | null;
         };
         BaseMap: {
             attribution: string;
@@ -2725,16 +2725,6 @@ export interface components {
             marker_mm: number;
             rows: number;
             square_mm: number;
-        };
-        BoardIn: {
-            /** @default 7 */
-            columns?: number;
-            /** @default 18 */
-            marker_mm?: number;
-            /** @default 10 */
-            rows?: number;
-            /** @default 25 */
-            square_mm?: number;
         };
         /** @enum {string} */
         BoundaryStyle: "solid" | "dashed" | "none" | "unknown";
@@ -2783,8 +2773,31 @@ export interface components {
             height_px: number;
             width_px: number;
         };
+        CalibrationBoard: {
+            /** @default 7 */
+            columns?: number;
+            /** @default 18 */
+            marker_mm?: number;
+            /** @default 10 */
+            rows?: number;
+            /** @default 25 */
+            square_mm?: number;
+        };
         CalibrationChoice: {
             calibration_id: string;
+        };
+        CalibrationDeclaration: {
+            /**
+             * @default {
+             *       "columns": 7,
+             *       "rows": 10,
+             *       "square_mm": 25,
+             *       "marker_mm": 18
+             *     }
+             */
+            board?: components["schemas"]["CalibrationBoard"];
+            /** @default null */
+            coefficients?: (4 | 5 | 8) | null;
         };
         CalibrationDocument: {
             board: components["schemas"]["Board"];
@@ -2801,11 +2814,6 @@ export interface components {
             views: components["schemas"]["CalibrationView"][];
             who: string;
         };
-        CalibrationIn: {
-            board?: components["schemas"]["BoardIn"];
-            /** @default null */
-            coefficients?: (4 | 5 | 8) | null;
-        };
         CalibrationPage: {
             items: components["schemas"]["CalibrationDocument"][];
         };
@@ -2820,7 +2828,7 @@ export interface components {
             tilt_deg: number | null;
             used: boolean;
         };
-        CameraIn: {
+        CameraDeclaration: {
             /** @default 0 */
             azimuth_deg?: number;
             /** @default null */
@@ -2829,6 +2837,7 @@ export interface components {
             cy_px?: number | null;
             /** @default 23 */
             depression_deg?: number;
+            /** @default [] */
             distortion?: number[];
             /** @default 0 */
             forward_m?: number;
@@ -2919,17 +2928,17 @@ export interface components {
             /** @default 60 */
             speed_kmh?: number;
         };
-        CanIn: {
+        CanDeclaration: {
             /** @default null */
             channel?: string | number | null;
             /** @default null */
-            heading?: components["schemas"]["CanSignalIn"] | null;
+            heading?: components["schemas"]["CanSignal"] | null;
             /** @default null */
             offset_s?: number | null;
             /** @default null */
-            speed?: components["schemas"]["CanSignalIn"] | null;
+            speed?: components["schemas"]["CanSignal"] | null;
         };
-        CanSignalIn: {
+        CanSignal: {
             /** @default null */
             arbitration_id?: number | null;
             /**
@@ -3083,18 +3092,7 @@ export interface components {
             state: string;
             to_time: string | null;
         };
-        ClockIn: {
-            /** @default 0 */
-            offset_s?: number;
-            /**
-             * @default auto
-             * @enum {string}
-             */
-            scale?: "auto" | "unix-s" | "unix-ms" | "unix-us" | "unix-ns" | "gps-s" | "gps-ms";
-            /** @default 0 */
-            utc_offset_s?: number;
-        };
-        CoarsePositionIn: {
+        CoarsePosition: {
             accuracy_m: number;
             lat_deg: number;
             lon_deg: number;
@@ -3182,40 +3180,6 @@ export interface components {
             crs: string[];
             links: components["schemas"]["Link"][];
         };
-        ColumnsIn: {
-            /**
-             * @default .
-             * @enum {string}
-             */
-            decimal?: "." | ",";
-            /**
-             * @default ,
-             * @enum {string}
-             */
-            delimiter?: "," | ";" | "\t";
-            field?: string[][];
-            /** @default heading_deg */
-            heading?: string | null;
-            /**
-             * @default deg
-             * @enum {string}
-             */
-            heading_unit?: "deg" | "rad";
-            /** @default speed_m_s */
-            speed?: string | null;
-            /**
-             * @default m/s
-             * @enum {string}
-             */
-            speed_unit?: "m/s" | "km/h" | "mph" | "kn";
-            /** @default t_s */
-            time?: string;
-            /**
-             * @default s
-             * @enum {string}
-             */
-            time_unit?: "s" | "ms" | "us" | "ns" | "iso";
-        };
         CommittedPlan: {
             alignment_id: string;
             approver: string | null;
@@ -3266,28 +3230,6 @@ export interface components {
         };
         Conformance: {
             conformsTo: string[];
-        };
-        ContextIn: {
-            /** @default null */
-            camera?: components["schemas"]["CameraIn"] | null;
-            /** @default null */
-            captured_at?: string | null;
-            /** @default null */
-            coarse_position?: components["schemas"]["CoarsePositionIn"] | null;
-            /** @default null */
-            frames?: components["schemas"]["FramesIn"] | null;
-            /** @default null */
-            heading_deg?: number | null;
-            /** @default null */
-            packets?: components["schemas"]["PacketsIn"] | null;
-            /** @default false */
-            thermal?: boolean;
-            /** @default null */
-            thermal_range?: number[] | null;
-            /** @default null */
-            trace?: components["schemas"]["TraceIn"] | null;
-            /** @default null */
-            vehicle?: string | null;
         };
         ControlPointIn: {
             easting: number;
@@ -3438,6 +3380,85 @@ export interface components {
              * @enum {string}
              */
             warnings?: "store" | "refuse";
+        };
+        DeclaredFrames: {
+            /** @default null */
+            poses?: components["schemas"]["PoseDeclaration"] | null;
+            /** @default null */
+            rate_hz?: number | null;
+        };
+        DeclaredPackets: {
+            /** @default false */
+            accept_clear?: boolean;
+            /** @default null */
+            clock?: components["schemas"]["LogClock"] | null;
+            /** @default null */
+            columns?: {
+                [key: string]: string;
+            } | null;
+            /** @default null */
+            files?: {
+                [key: string]: "packets" | "poses" | "frame";
+            } | null;
+            /** @default null */
+            freshness?: components["schemas"]["FreshnessDeclaration"] | null;
+            /** @default null */
+            lane?: components["schemas"]["LaneDeclaration"] | null;
+            /**
+             * @default waymark
+             * @enum {string}
+             */
+            method?: "waymark" | "paper";
+            /** @default auto */
+            payload_text?: components["schemas"]["PayloadText"];
+            /** @default null */
+            poses?: components["schemas"]["PoseDeclaration"] | null;
+            /** @default null */
+            receiver?: components["schemas"]["ReceiverDeclaration"] | null;
+            /**
+             * @default predictive
+             * @enum {string}
+             */
+            steering?: "predictive" | "stanley" | "stanley-lookahead" | "none";
+        };
+        DeclaredTrace: {
+            /** @default null */
+            axes?: ("ISO8855" | "FLU" | "FRD") | null;
+            /** @default false */
+            background_removed?: boolean;
+            /** @default null */
+            bar?: components["schemas"]["BarDeclaration"] | null;
+            /** @default false */
+            calibrated?: boolean;
+            /** @default null */
+            can?: components["schemas"]["CanDeclaration"] | null;
+            /** @default null */
+            clock_offsets_s?: {
+                [key: string]: number;
+            } | null;
+            /** @default null */
+            columns?: components["schemas"]["TraceColumns"] | null;
+            /** @default null */
+            formats?: {
+                [key: string]: "metro-stream" | "csv" | "parquet" | "can-log" | "dbc";
+            } | null;
+            /** @default null */
+            interval_extra_us?: number | null;
+            /**
+             * @default matched
+             * @enum {string}
+             */
+            method?: "matched" | "metro";
+            /** @default null */
+            rate_hz?: number | null;
+            /** @default 2000 */
+            reach_m?: number;
+            /** @default null */
+            speed_m_s?: number | null;
+            /** @default null */
+            tag_formats?: components["schemas"]["TagFormat"][] | null;
+            /** @default null */
+            unit?: ("uT" | "nT" | "mT" | "gauss" | "mG") | null;
         };
         DecodedLaneDocument: {
             left: number[][][];
@@ -3619,7 +3640,7 @@ export interface components {
             lat_deg: number;
             lon_deg: number;
         };
-        DriveDecodeIn: {
+        DriveDecode: {
             clock?: string | null;
             /** @default 0.5 */
             clock_sigma_s?: number;
@@ -3655,12 +3676,6 @@ export interface components {
             state: "queued" | "running" | "done" | "failed" | "cancelled";
             vehicle: string | null;
         };
-        DriveIn: {
-            decodes: components["schemas"]["DriveDecodeIn"][];
-            name?: string | null;
-            options?: components["schemas"]["DriveOptionsIn"];
-            vehicle?: string | null;
-        };
         DriveLinks: {
             csv?: string;
             geojson?: string;
@@ -3684,7 +3699,7 @@ export interface components {
             time: string | null;
             used: boolean;
         };
-        DriveOptionsIn: {
+        DriveOptions: {
             /** @default 3 */
             heading_bias_sigma_deg?: number;
             /** @default 2 */
@@ -3697,6 +3712,10 @@ export interface components {
             speed_scale_sigma?: number;
             /** @default false */
             use_unfit?: boolean;
+            /** @default 100 */
+            wander_length_m?: number;
+            /** @default 0.4 */
+            wander_m?: number;
         };
         DrivePage: {
             items: components["schemas"]["DriveHead"][];
@@ -4131,12 +4150,6 @@ export interface components {
             source: string;
             speed_m_s: number | null;
         };
-        FramesIn: {
-            /** @default null */
-            poses?: components["schemas"]["PosesIn"] | null;
-            /** @default null */
-            rate_hz?: number | null;
-        };
         FrameSummary: {
             fixes: number;
             frames: number;
@@ -4148,7 +4161,7 @@ export interface components {
             plates_read: number;
             text: string;
         };
-        FreshnessIn: {
+        FreshnessDeclaration: {
             /** @default 60 */
             clock_tolerance_s?: number;
             /** @default 3 */
@@ -4377,6 +4390,14 @@ export interface components {
             links: components["schemas"]["Link"][];
             title: string;
         };
+        LaneDeclaration: {
+            /** @default 150 */
+            bridge_m?: number;
+            /** @default 0.6 */
+            off_the_line_m?: number;
+            /** @default 3.3 */
+            usual_width_m?: number;
+        };
         LaneDocument: {
             geometry: components["schemas"]["LaneGeometryDocument"];
             given: number[][] | null;
@@ -4418,14 +4439,6 @@ export interface components {
             right_style: string;
             road: string;
             station_m: number[];
-        };
-        LaneRulesIn: {
-            /** @default 150 */
-            bridge_m?: number;
-            /** @default 0.6 */
-            off_the_line_m?: number;
-            /** @default 3.3 */
-            usual_width_m?: number;
         };
         LaneStations: {
             confidence: (number | null)[];
@@ -4531,6 +4544,14 @@ export interface components {
         LocatedPosition: {
             ambiguous: boolean;
             feet: components["schemas"]["FootDocument"][];
+        };
+        LogClock: {
+            /** @default 0 */
+            offset_s?: number;
+            /** @default auto */
+            scale?: components["schemas"]["TimeScale"];
+            /** @default 0 */
+            utc_offset_s?: number;
         };
         LogFileDocument: {
             entries: number;
@@ -4766,6 +4787,24 @@ export interface components {
             id: string;
             name: string;
         };
+        NewDrive: {
+            decodes: components["schemas"]["DriveDecode"][];
+            name?: string | null;
+            /**
+             * @default {
+             *       "rate_hz": 2,
+             *       "max_sigma_m": 2,
+             *       "outlier_probability": 0.001,
+             *       "speed_scale_sigma": 0.03,
+             *       "heading_bias_sigma_deg": 3,
+             *       "wander_m": 0.4,
+             *       "wander_length_m": 100,
+             *       "use_unfit": false
+             *     }
+             */
+            options?: components["schemas"]["DriveOptions"];
+            vehicle?: string | null;
+        };
         NewFeature: {
             geometry?: {
                 [key: string]: components["schemas"]["JsonValue"];
@@ -4792,6 +4831,12 @@ export interface components {
             valid: boolean;
         };
         NewMarkerIn: components["schemas"]["PlateIn"] | components["schemas"]["MagnetIn"] | components["schemas"]["CerpmIn"] | components["schemas"]["FiducialIn"];
+        NewVehicle: {
+            name: string;
+            note?: string | null;
+            /** @default {} */
+            profile?: components["schemas"]["VehicleProfile"];
+        };
         NewWebhookDocument: {
             /** Format: date-time */
             created_at: string;
@@ -4901,12 +4946,6 @@ export interface components {
             title_block?: components["schemas"]["TitleBlockIn"];
             unit?: ("m" | "ft-us" | "ft-intl") | null;
         };
-        PacketReceiverIn: {
-            /** @default null */
-            antenna_height_m?: number | null;
-            /** @default null */
-            sensitivity_dbm?: number | null;
-        };
         PacketReportDocument: {
             decode_ms: number;
             driven_m: number | null;
@@ -4936,43 +4975,6 @@ export interface components {
             track: components["schemas"]["VehicleTrackDocument"] | null;
             verdict: (string | null)[];
         };
-        PacketsIn: {
-            /** @default false */
-            accept_clear?: boolean;
-            /** @default null */
-            clock?: components["schemas"]["ClockIn"] | null;
-            /** @default null */
-            columns?: {
-                [key: string]: string;
-            } | null;
-            /** @default null */
-            files?: {
-                [key: string]: "packets" | "poses" | "frame";
-            } | null;
-            /** @default null */
-            freshness?: components["schemas"]["FreshnessIn"] | null;
-            /** @default null */
-            lane?: components["schemas"]["LaneRulesIn"] | null;
-            /**
-             * @default waymark
-             * @enum {string}
-             */
-            method?: "waymark" | "paper";
-            /**
-             * @default auto
-             * @enum {string}
-             */
-            payload_text?: "auto" | "hex" | "base64";
-            /** @default null */
-            poses?: components["schemas"]["PosesIn"] | null;
-            /** @default null */
-            receiver?: components["schemas"]["PacketReceiverIn"] | null;
-            /**
-             * @default predictive
-             * @enum {string}
-             */
-            steering?: "predictive" | "stanley" | "stanley-lookahead" | "none";
-        };
         PacketSummary: {
             accepted: number;
             in_clear: number;
@@ -4992,7 +4994,7 @@ export interface components {
         };
         PartsIn: {
             /** @default null */
-            context?: components["schemas"]["ContextIn"] | null;
+            context?: components["schemas"]["UploadContext"] | null;
             /** @default  */
             file_name?: string;
             /** @constant */
@@ -5040,6 +5042,8 @@ export interface components {
         };
         /** @enum {string} */
         PayloadFormat: "bin" | "hex" | "json";
+        /** @enum {string} */
+        PayloadText: "auto" | "hex" | "base64";
         PlacedMarkersIn: {
             chainage_m: number[];
             offset_m: number[];
@@ -5351,17 +5355,11 @@ export interface components {
              */
             type: "Polygon";
         };
-        PoseDocument: {
-            covariance: number[][];
-            reprojection_rms_px: number;
-            rotation: number[][];
-            translation_m: number[];
-        };
-        PosesIn: {
+        PoseDeclaration: {
             /** @default null */
             accuracy_m?: number | null;
             /** @default null */
-            clock?: components["schemas"]["ClockIn"] | null;
+            clock?: components["schemas"]["LogClock"] | null;
             /** @default null */
             columns?: {
                 [key: string]: string;
@@ -5374,6 +5372,12 @@ export interface components {
             forward_m?: number | null;
             /** @default null */
             left_m?: number | null;
+        };
+        PoseDocument: {
+            covariance: number[][];
+            reprojection_rms_px: number;
+            rotation: number[][];
+            translation_m: number[];
         };
         PositionDocument: {
             check_points: number | null;
@@ -5565,14 +5569,6 @@ export interface components {
             lat_deg: number;
             lon_deg: number;
             value: number | string | null;
-        };
-        ProfileIn: {
-            camera?: components["schemas"]["VehicleCameraIn"] | null;
-            frames?: components["schemas"]["FramesIn"] | null;
-            packets?: components["schemas"]["PacketsIn"] | null;
-            thermal?: boolean | null;
-            thermal_range?: number[] | null;
-            trace?: components["schemas"]["TraceIn"] | null;
         };
         ProgramsIn: {
             bbox?: number[] | null;
@@ -5817,6 +5813,12 @@ export interface components {
         ReceivedReport: {
             /** @constant */
             status: "received";
+        };
+        ReceiverDeclaration: {
+            /** @default null */
+            antenna_height_m?: number | null;
+            /** @default null */
+            sensitivity_dbm?: number | null;
         };
         ReceiverIn: {
             /** @default 6 */
@@ -6194,16 +6196,35 @@ export interface components {
             reason: string | null;
             speed_m_s: number | null;
         };
-        SensorIn: {
-            position_m: number[];
-            /**
-             * @default array
-             * @enum {string}
-             */
-            role?: "array" | "reference";
+        SensorDeclaration: {
+            position_m: [
+                number,
+                number,
+                number
+            ];
+            /** @default array */
+            role?: components["schemas"]["SensorRole"];
             /** @default null */
-            vehicle_from_sensor?: number[][] | null;
+            vehicle_from_sensor?: [
+                [
+                    number,
+                    number,
+                    number
+                ],
+                [
+                    number,
+                    number,
+                    number
+                ],
+                [
+                    number,
+                    number,
+                    number
+                ]
+            ] | null;
         };
+        /** @enum {string} */
+        SensorRole: "array" | "reference";
         ServerSettings: {
             base_map: ("pmtiles" | "raster") | null;
             broker: "amqp" | null;
@@ -6375,7 +6396,7 @@ export interface components {
             along_m: number;
             heading_deg: number;
         };
-        TagFormatIn: {
+        TagFormat: {
             /** @default 4 */
             length_m?: number;
             /** @default 3 */
@@ -6452,6 +6473,8 @@ export interface components {
         TileSets: {
             tilesets: components["schemas"]["TileSet"][];
         };
+        /** @enum {string} */
+        TimeScale: "auto" | "unix-s" | "unix-ms" | "unix-us" | "unix-ns" | "gps-s" | "gps-ms";
         TitleBlockIn: {
             /** @default  */
             approver?: string;
@@ -6466,51 +6489,51 @@ export interface components {
             /** @default  */
             title?: string;
         };
+        TraceColumns: {
+            /**
+             * @default .
+             * @enum {string}
+             */
+            decimal?: "." | ",";
+            /**
+             * @default ,
+             * @enum {string}
+             */
+            delimiter?: "," | ";" | "\t";
+            /** @default [] */
+            field?: [
+                string,
+                string,
+                string
+            ][];
+            /** @default heading_deg */
+            heading?: string | null;
+            /**
+             * @default deg
+             * @enum {string}
+             */
+            heading_unit?: "deg" | "rad";
+            /** @default speed_m_s */
+            speed?: string | null;
+            /**
+             * @default m/s
+             * @enum {string}
+             */
+            speed_unit?: "m/s" | "km/h" | "mph" | "kn";
+            /** @default t_s */
+            time?: string;
+            /**
+             * @default s
+             * @enum {string}
+             */
+            time_unit?: "s" | "ms" | "us" | "ns" | "iso";
+        };
         TraceGapDocument: {
             lost_s: number;
             part: string;
             sample: number;
             skipped_bytes: number;
             t_s: number;
-        };
-        TraceIn: {
-            /** @default null */
-            axes?: ("ISO8855" | "FLU" | "FRD") | null;
-            /** @default false */
-            background_removed?: boolean;
-            /** @default null */
-            bar?: components["schemas"]["BarIn"] | null;
-            /** @default false */
-            calibrated?: boolean;
-            /** @default null */
-            can?: components["schemas"]["CanIn"] | null;
-            /** @default null */
-            clock_offsets_s?: {
-                [key: string]: number;
-            } | null;
-            /** @default null */
-            columns?: components["schemas"]["ColumnsIn"] | null;
-            /** @default null */
-            formats?: {
-                [key: string]: "metro-stream" | "csv" | "parquet" | "can-log" | "dbc";
-            } | null;
-            /** @default null */
-            interval_extra_us?: number | null;
-            /**
-             * @default matched
-             * @enum {string}
-             */
-            method?: "matched" | "metro";
-            /** @default null */
-            rate_hz?: number | null;
-            /** @default 2000 */
-            reach_m?: number;
-            /** @default null */
-            speed_m_s?: number | null;
-            /** @default null */
-            tag_formats?: components["schemas"]["TagFormatIn"][] | null;
-            /** @default null */
-            unit?: ("uT" | "nT" | "mT" | "gauss" | "mG") | null;
         };
         TraceMotionDocument: {
             heading_deg: (number | null)[];
@@ -6594,6 +6617,31 @@ export interface components {
             marker_id: string;
             why: string | null;
         };
+        UploadContext: {
+            /** @default null */
+            camera?: components["schemas"]["CameraDeclaration"] | null;
+            /** @default null */
+            captured_at?: string | null;
+            /** @default null */
+            coarse_position?: components["schemas"]["CoarsePosition"] | null;
+            /** @default null */
+            frames?: components["schemas"]["DeclaredFrames"] | null;
+            /** @default null */
+            heading_deg?: number | null;
+            /** @default null */
+            packets?: components["schemas"]["DeclaredPackets"] | null;
+            /** @default null */
+            thermal?: boolean | null;
+            /** @default null */
+            thermal_range?: [
+                number,
+                number
+            ] | null;
+            /** @default null */
+            trace?: components["schemas"]["DeclaredTrace"] | null;
+            /** @default null */
+            vehicle?: string | null;
+        };
         UploadDocument: {
             /** Format: date-time */
             created_at: string;
@@ -6618,7 +6666,7 @@ export interface components {
             decode_id: string;
             picture: string;
         };
-        VehicleCameraIn: {
+        VehicleCamera: {
             /** @default 0 */
             azimuth_deg?: number;
             calibration_id?: string | null;
@@ -6626,6 +6674,7 @@ export interface components {
             cy_px?: number | null;
             /** @default 23 */
             depression_deg?: number;
+            /** @default [] */
             distortion?: number[];
             /** @default 0 */
             forward_m?: number;
@@ -6642,6 +6691,19 @@ export interface components {
             /** @default 0 */
             roll_deg?: number;
             width_px?: number | null;
+        };
+        VehicleChange: {
+            /** @default  */
+            name?: string;
+            note?: string | null;
+            /** @default {} */
+            profile?: components["schemas"]["VehicleProfile"];
+            reason?: string | null;
+            /**
+             * @default active
+             * @enum {string}
+             */
+            status?: "active" | "retired";
         };
         VehicleDocument: {
             /** Format: date-time */
@@ -6662,11 +6724,6 @@ export interface components {
             uploads: number;
             version: number;
         };
-        VehicleIn: {
-            name: string;
-            note?: string | null;
-            profile?: components["schemas"]["ProfileIn"];
-        };
         VehicleKey: {
             expires_at: string | null;
             id: string;
@@ -6678,17 +6735,16 @@ export interface components {
         VehiclePage: {
             items: components["schemas"]["VehicleDocument"][];
         };
-        VehiclePatch: {
-            /** @default  */
-            name?: string;
-            note?: string | null;
-            profile?: components["schemas"]["ProfileIn"];
-            reason?: string | null;
-            /**
-             * @default active
-             * @enum {string}
-             */
-            status?: "active" | "retired";
+        VehicleProfile: {
+            camera?: components["schemas"]["VehicleCamera"] | null;
+            frames?: components["schemas"]["DeclaredFrames"] | null;
+            packets?: components["schemas"]["DeclaredPackets"] | null;
+            thermal?: boolean | null;
+            thermal_range?: [
+                number,
+                number
+            ] | null;
+            trace?: components["schemas"]["DeclaredTrace"] | null;
         };
         VehicleTrackDocument: {
             heading_deg: (number | null)[];
@@ -8013,7 +8069,7 @@ export interface operations {
         requestBody: {
             content: {
                 "multipart/form-data": {
-                    declaration?: components["schemas"]["CalibrationIn"];
+                    declaration?: components["schemas"]["CalibrationDeclaration"];
                     photos: string[];
                 };
             };
@@ -8460,7 +8516,7 @@ export interface operations {
                 "image/jpeg": string;
                 "image/png": string;
                 "multipart/form-data": {
-                    context?: components["schemas"]["ContextIn"];
+                    context?: components["schemas"]["UploadContext"];
                     /** Format: binary */
                     file: string;
                     vehicle?: string;
@@ -8811,7 +8867,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["DriveIn"];
+                "application/json": components["schemas"]["NewDrive"];
             };
         };
         responses: {
@@ -11439,7 +11495,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["VehicleIn"];
+                "application/json": components["schemas"]["NewVehicle"];
             };
         };
         responses: {
@@ -11510,7 +11566,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["VehiclePatch"];
+                "application/json": components["schemas"]["VehicleChange"];
             };
         };
         responses: {

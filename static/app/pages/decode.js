@@ -29,7 +29,7 @@ export default function Decode({ parameters }) {
 
 function Upload() {
   const form = useForm({ context: "" });
-  const schema = useLoad(() => loadSchema("ContextIn"), []);
+  const schema = useLoad(() => loadSchema("UploadContext"), []);
   useEffect(() => {
     restore();
   }, []);

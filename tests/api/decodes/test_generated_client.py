@@ -53,7 +53,7 @@ def test_the_generated_client_uploads_a_frame(
     key = client.headers["Authorization"].removeprefix("Bearer ")
     caller = package.AuthenticatedClient(server.url, token=key, timeout=httpx.Timeout(120), verify_ssl=False)
     frame = types.File(BytesIO(png(standin.frame_that(standin.OBEY))), "frame.png", "image/png")
-    body = models.PostDecodeFilesBody(file=frame, context=models.ContextIn.from_dict(near(plate)))
+    body = models.PostDecodeFilesBody(file=frame, context=models.UploadContext.from_dict(near(plate)))
 
     with caller:
         answer = post_decode.sync_detailed(client=caller, body=body, idempotency_key="one")

@@ -24,14 +24,15 @@ from app.decoders.plate.reader import decode_plates
 from app.decoders.snapshot import Snapshot, open_snapshot
 from app.demo.cerpms import build_lane
 from app.formats.format import SpooledFile
+from app.formats.traces.declaration import TraceDeclaration
 from app.formats.traces.read import read_trace
 from app.geodesy import decimal_year, move_to_epoch
 from app.lanes.estimate import fit_lane
 from app.lanes.types import LaneMarkers
 from app.main import create_app
 from app.markers.snapshot import Trust
+from app.sensors.magnetometer_bar import MagnetometerBar
 from app.services.access.access import Scope
-from app.services.decodes.declarations import trace_terms
 from app.services.decodes.packet_tasks import read_drive
 from app.settings import Settings
 from app.simulation.magnetic.recorder import write_recorder_files
@@ -109,8 +110,8 @@ def test_a_trace_gives_the_same_tags_meanings_and_fixes(real_client: httpx.Clien
     coarse = lane.context["coarse_position"]
     snapshot = _snapshot(real_client, coarse["lon_deg"], coarse["lat_deg"])
     place = (coarse["lon_deg"], coarse["lat_deg"], 2050.0)
-    bar = trace_terms({}).bar
-    trace = read_trace({"drive.zip": data}, trace_terms({}).declaration).trace
+    bar = MagnetometerBar.metro()
+    trace = read_trace({"drive.zip": data}, TraceDeclaration()).trace
     found = decode_trace(trace, bar, candidates=snapshot.tag_candidates(*place))
     offline = match_tags(found, snapshot.registered_tags(*place), bar).tags
     assert len(offline) == len(decode["tags"]) == 3
@@ -143,8 +144,8 @@ def test_where_no_tag_is_registered_the_codebooks_say_what_to_look_for(real_clie
     data = _zipped(write_recorder_files(_drive(codes=codes).trace))
     decode = post_frame(real_client, data, {"trace": {}}, name="drive.zip").json()
     snapshot = _snapshot(real_client, 8.4, 49.0)
-    bar = trace_terms({}).bar
-    trace = read_trace({"drive.zip": data}, trace_terms({}).declaration).trace
+    bar = MagnetometerBar.metro()
+    trace = read_trace({"drive.zip": data}, TraceDeclaration()).trace
     found = decode_trace(trace, bar, candidates=snapshot.tag_candidates(8.4, 49.0, 2050.0))
     tags = match_tags(found, (), bar).tags
     assert [tag.reading.tag.text for tag in tags if tag.reading.tag] == [tag["tag"] for tag in decode["tags"]]

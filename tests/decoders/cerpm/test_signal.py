@@ -12,10 +12,10 @@ from time import process_time
 import numpy as np
 import numpy.typing as npt
 import pytest
+from pydantic import ValidationError
 
 from app.decoders.cerpm.signal import SignalHealth, SignalReport, SignalRules, profile_signals
 from app.decoders.cerpm.verify import Verdict, VerifiedPacket
-from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage
 from app.radio.link import EXPONENT, fit_path_loss
 from app.sensors.pose_track import PoseTrack, ReceivedPacket
@@ -274,8 +274,8 @@ def memory_limit(limit: int) -> Iterator[None]:
 
 def test_rules_are_checked() -> None:
     for values in ({"weak_db": 1.0}, {"failing_db": -3.0}, {"weak_share": 0.1}, {"failing_share": 0.0}):
-        with pytest.raises(InvalidParameter):
-            SignalRules(**values)  # type: ignore[arg-type]
+        with pytest.raises(ValidationError):
+            SignalRules(**values)
 
 
 def test_many_packets_take_seconds() -> None:

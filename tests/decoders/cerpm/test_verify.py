@@ -8,9 +8,9 @@ from time import process_time
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from app.decoders.cerpm.verify import FreshnessRules, SequenceSpan, Verdict, Verification, verify_packets
-from app.errors import InvalidParameter
 from app.sensors.pose_track import PlainClaim, ReceivedPacket
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S, body, heard, key_of, signed
 
@@ -270,7 +270,7 @@ def test_a_long_log_takes_seconds() -> None:
 @pytest.mark.parametrize("name", ["clock_tolerance_s", "echo_s", "min_interval_s", "uploaded_at_s"])
 def test_rules_are_checked(name: str) -> None:
     for value in (-1.0, math.nan, math.inf):
-        with pytest.raises(InvalidParameter, match=name):
+        with pytest.raises(ValidationError, match=name):
             FreshnessRules(**{name: value})
 
 

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from time import process_time
 
 import pytest
+from pydantic import ValidationError
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.logs import LogClock, TimeScale, utc_from_gps_s
@@ -144,7 +145,7 @@ def test_declared_columns() -> None:
     assert read(text, declared).packets[0].received_at_s == AT_S
     with pytest.raises(InvalidParameter, match="no column 'e' for snr"):
         read(text, PacketDeclaration(columns={"number": "a", "lon": "b", "lat": "c", "snr": "e"}))
-    with pytest.raises(InvalidParameter, match="colour"):
+    with pytest.raises(ValidationError, match="colour"):
         PacketDeclaration(columns={"colour": "a"})
 
 
@@ -162,9 +163,9 @@ def test_declared_columns() -> None:
         ("2026-03-16 13:39:32", LogClock()),
         ("2026-03-16T09:39:32-04:00", LogClock()),
         ("2026-03-16T09:39:32", LogClock(utc_offset_s=-4 * 3600)),
-        (1457703590, LogClock(TimeScale.GPS_S)),
-        (1457703590000, LogClock(TimeScale.GPS_MS)),
-        ("12.5", LogClock(TimeScale.UNIX_S, offset_s=AT_S - 12.5)),
+        (1457703590, LogClock(scale=TimeScale.GPS_S)),
+        (1457703590000, LogClock(scale=TimeScale.GPS_MS)),
+        ("12.5", LogClock(scale=TimeScale.UNIX_S, offset_s=AT_S - 12.5)),
     ],
 )
 def test_times(written: object, clock: LogClock) -> None:

@@ -7,7 +7,7 @@ import zipfile
 
 import numpy as np
 
-from app.sensors.magnetometer_bar import MagnetTrace
+from app.sensors.magnetometer_bar import BarDeclaration, MagnetTrace
 
 FRD = np.array((1.0, -1.0, -1.0), np.float32)
 
@@ -25,6 +25,13 @@ def make_trace(samples: int = 2000, *, seed: int = 0, offset_ut: float = 200.0, 
     speed = np.round((13 + 2 * np.sin(speed_t / 3)) * 360) / 360
     heading_t = np.arange(0, t[-1], 0.01)
     return MagnetTrace(t, field.astype(np.float32), speed_t, speed, heading_t, (355 + 2 * heading_t) % 360)
+
+
+def bar_of(sensors: int, turns: np.ndarray | None = None) -> BarDeclaration:
+    """A bar of so many sensors in a row, without references; `turns` are rotations of its chips."""
+    rotations = [None] * sensors if turns is None else turns.tolist()
+    row = [{"position_m": (0.0, 0.16 * k, 0.0), "vehicle_from_sensor": rotations[k]} for k in range(sensors)]
+    return BarDeclaration.model_validate({"sensors": row})
 
 
 def plain_csv(

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.traces.declaration import (
-    ByteOrder,
     CanDeclaration,
     CanSignal,
     TraceDeclaration,
@@ -42,7 +42,7 @@ BO_ 1796 Attitude: 8 ECU
  SG_ Pitch m2 : 8|16@1- (0.01,0) [-90|90] "deg" ECU
 """
 SPEED = CanSignal(
-    arbitration_id=0x36A, start_bit=23, length=12, byte_order=ByteOrder.BIG, factor=1 / 64, unit="km/h", maximum=300
+    arbitration_id=0x36A, start_bit=23, length=12, byte_order="big", factor=1 / 64, unit="km/h", maximum=300
 )
 HEADING = CanSignal(arbitration_id=0x705, start_bit=0, length=16, signed=True, factor=0.01, offset=180, unit="deg")
 EPOCH_S = 1_700_000_000.0
@@ -119,7 +119,7 @@ def test_bits_are_read_as_cantools_reads_them() -> None:
         text = f'VERSION ""\nBO_ 5 M: 8 E\n SG_ S : {name} (0.5,-3) [0|0] "" E\n'
         message = cantools.database.load_string(text, "dbc").messages[0]
         frames = [rng.bytes(8) for _ in range(5)]
-        order = ByteOrder.BIG if big else ByteOrder.LITTLE
+        order = "big" if big else "little"
         signal = CanSignal(
             arbitration_id=5, start_bit=start, length=length, byte_order=order, signed=signed, factor=0.5, offset=-3
         )
@@ -169,7 +169,7 @@ def test_values_that_say_no_value_are_left_out(tmp_path: Path) -> None:
     speeds = trace.speed_m_s.copy()
     speeds[5:8] = 0xFFF / 64 / 3.6
     broken = MagnetTrace(trace.t_s, trace.field_ut, trace.speed_t_s, speeds, trace.heading_t_s, trace.heading_deg)
-    tight = CanSignal(**{name: getattr(SPEED, name) for name in CanSignal.__slots__} | {"maximum": 60.0})
+    tight = SPEED.model_copy(update={"maximum": 60.0})
     result = read(trace, "a.log", log(broken, "log", tmp_path), declared(speed=tight))
     assert len(result.trace.speed_t_s) == len(speeds) - 3
     assert ("speed-invalid", 3) in [(e.what, e.count) for e in result.report.left_out]
@@ -194,10 +194,9 @@ def test_bad_declarations(tmp_path: Path) -> None:
     refused("can.speed", declared(speed=CanSignal(name="Speed")))
     assert "'Speed'" in refused("the DBC", declared(speed=CanSignal(name="Sped")), **{"car.dbc": DBC})
     refused("speed", declared(speed=CanSignal(arbitration_id=0x36A, start_bit=0, length=64, unit="m/s")))
-    with pytest.raises(InvalidParameter):
-        CanSignal()
-    with pytest.raises(InvalidParameter):
-        CanSignal(arbitration_id=1, length=65)
+    for wrong in ({}, {"arbitration_id": 1, "length": 65}, {"arbitration_id": 1, "factor": 0.0}):
+        with pytest.raises(ValidationError):
+            CanSignal.model_validate(wrong)
 
 
 def test_damaged_logs(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.formats.traces.declaration import TraceDeclaration, TraceFormat, TraceLimits
 from app.formats.traces.read import read_trace
 from app.simulation.magnetic.recorder import write_array_stream, write_recorder_files
-from tests.formats.traces.recordings import make_trace, zipped
+from tests.formats.traces.recordings import bar_of, make_trace, zipped
 
 
 def test_a_zip_of_the_three_files_comes_back() -> None:
@@ -60,7 +60,7 @@ def test_a_stream_with_the_recorders_speed() -> None:
 
 def test_axes_can_be_declared() -> None:
     trace = make_trace(300)
-    result = read_trace(write_recorder_files(trace), TraceDeclaration(axes="ISO8855"))  # type: ignore[arg-type]
+    result = read_trace(write_recorder_files(trace), TraceDeclaration(axes="ISO8855"))
     assert np.array_equal(result.trace.field_ut[:, :, 1:], -trace.field_ut[:, :, 1:])
 
 
@@ -138,7 +138,7 @@ def test_fewer_sensors_than_declared() -> None:
     files = write_recorder_files(make_trace(100, sensors=8))
     with pytest.raises(InvalidParameter, match="Sensor 9"):
         read_trace(files)
-    assert read_trace(files, TraceDeclaration(sensors=8)).trace.field_ut.shape == (100, 8, 3)
+    assert read_trace(files, TraceDeclaration(bar=bar_of(8))).trace.field_ut.shape == (100, 8, 3)
 
 
 def test_no_speed() -> None:

@@ -12,7 +12,7 @@ from app.errors import UnreadableUpload, UploadTooLarge, WaymarkError
 from app.formats.traces.declaration import TraceDeclaration, TraceFile, TraceLimits
 from app.formats.traces.read import read_trace
 from app.simulation.magnetic.recorder import write_array_stream
-from tests.formats.traces.recordings import FRD, make_trace
+from tests.formats.traces.recordings import FRD, bar_of, make_trace
 
 SAMPLE = 172
 DECLARED = TraceDeclaration(speed_m_s=13.0)
@@ -58,7 +58,7 @@ def test_a_whole_stream_comes_back() -> None:
 @pytest.mark.parametrize("sensors", [3, 8, 20])
 def test_other_numbers_of_sensors(sensors: int) -> None:
     trace = make_trace(1000, sensors=sensors)
-    result = read(write_array_stream(trace), TraceDeclaration(sensors=sensors, speed_m_s=13.0))
+    result = read(write_array_stream(trace), TraceDeclaration(bar=bar_of(sensors), speed_m_s=13.0))
     assert np.array_equal(result.trace.field_ut, trace.field_ut)
 
 
@@ -159,7 +159,7 @@ def test_what_is_no_stream_is_refused(content: bytes) -> None:
 
 def test_the_wrong_number_of_sensors_is_refused() -> None:
     with pytest.raises(UnreadableUpload) as error:
-        read(write_array_stream(make_trace(500)), TraceDeclaration(sensors=12, speed_m_s=13.0))
+        read(write_array_stream(make_trace(500)), TraceDeclaration(bar=bar_of(12), speed_m_s=13.0))
     assert "sensors" in (error.value.cure or "")
 
 
