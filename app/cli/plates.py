@@ -164,7 +164,7 @@ def decode_trace(
     from app.decoders.magnet.identify import match_tags
     from app.formats.format import SpooledFile
     from app.services.decodes.declarations import trace_terms
-    from app.services.decodes.trace_documents import trace_document
+    from app.services.decodes.trace_documents import trace_result
     from app.services.decodes.trace_tasks import decode_recording
 
     terms = read_declaration(TraceIn, declared, "docs/magnets.md").model_dump(exclude_unset=True)
@@ -172,5 +172,5 @@ def decode_trace(
     trace = match_tags(result.findings, (), trace_terms(terms).bar)
     if plot is not None:
         plot.write_bytes(result.plot)
-    document = trace_document(result, trace, codebook_tags=0)
+    document = trace_result(result, trace, codebook_tags=0)
     typer.echo(orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY))

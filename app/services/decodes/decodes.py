@@ -141,7 +141,7 @@ class Decodes:
             context = context_from_document(row.context)
             upload = Upload(agency_id, Author(""), file, context, row.created_at, wait_s=_WAIT_S, again_id=decode_id)
             decoded, plot = self._path.decode_again(upload, handler)
-        return dict(decoded.document), plot
+        return decoded.result, plot
 
     # --- stored decodes -----------------------------------------------------------------------------------------------
 

@@ -153,7 +153,7 @@ class PathLossDocument(TypedDict):
     fitted_exponent: bool
 
 
-class PacketsResult(TypedDict):
+class PacketsResult(TypedDict, total=False):
     """The result of decoding a packet log."""
 
     decoder: str

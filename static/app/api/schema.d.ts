@@ -3164,10 +3164,6 @@ export interface components {
              */
             scheme?: "id" | "position-robust" | "position-check" | "position";
         };
-        CodeMeaningDocument: {
-            kind: string;
-            value: number | string;
-        };
         CollectionDocument: {
             crs: string[];
             description: string;
@@ -3318,14 +3314,6 @@ export interface components {
             cells: number[][];
             share: number;
         };
-        CrossingDocument: {
-            confidence: number;
-            lateral_cm: number;
-            odometer_m: number;
-            side: string;
-            style: string;
-            t_s: number;
-        };
         DamageReport: {
             /** Format: date-time */
             created_at: string;
@@ -3458,47 +3446,7 @@ export interface components {
             stations: components["schemas"]["LaneStations"];
             track_agreement: components["schemas"]["TrackAgreementDocument"] | null;
         };
-        DecodeDocument: {
-            attempts: number;
-            codebook_plates?: number;
-            codebook_tags?: number;
-            context: {
-                [key: string]: components["schemas"]["JsonValue"];
-            };
-            /** Format: date-time */
-            created_at: string;
-            crossings?: components["schemas"]["CrossingDocument"][];
-            decoder?: string;
-            error: components["schemas"]["ErrorDocument"] | null;
-            file_name: string | null;
-            finished_at: string | null;
-            fix?: components["schemas"]["FixDocument"] | components["schemas"]["TagFixDocument"] | null;
-            frames?: components["schemas"]["FrameDocument"][];
-            gaps?: components["schemas"]["GapDocument"][];
-            id: string;
-            kind: components["schemas"]["DecodeKind"];
-            lane?: components["schemas"]["DecodedLaneDocument"];
-            links: components["schemas"]["DecodeLinks"];
-            magnets?: components["schemas"]["PassedMagnetDocument"][];
-            markers?: components["schemas"]["ReceivedMarkerDocument"][];
-            motion?: components["schemas"]["TraceMotionDocument"];
-            noise?: components["schemas"]["NoiseDocument"][];
-            overlay?: components["schemas"]["OverlayDocument"] | null;
-            partial?: boolean;
-            path_loss?: components["schemas"]["PathLossDocument"] | null;
-            plates?: components["schemas"]["SeenPlateDocument"][];
-            progress: number;
-            readings?: (components["schemas"]["PlateReadingDocumentInFrame"] | components["schemas"]["FiducialReadingDocumentInFrame"])[];
-            receiver?: components["schemas"]["ReceiverPositions"] | null;
-            report?: components["schemas"]["TraceReportDocument"] | components["schemas"]["PacketReportDocument"];
-            /** @enum {string} */
-            state: "queued" | "running" | "done" | "failed" | "cancelled";
-            steering?: components["schemas"]["SteeringDocument"] | null;
-            summary?: components["schemas"]["FrameSummary"] | components["schemas"]["TraceSummary"] | components["schemas"]["PacketSummary"];
-            tags?: components["schemas"]["TagDocument"][];
-            upload_bytes: number | null;
-            warnings?: string[];
-        };
+        DecodeDocument: components["schemas"]["FramesDecode"] | components["schemas"]["TraceDecode"] | components["schemas"]["PacketsDecode"];
         DecodeHead: {
             attempts: number;
             context: {
@@ -3950,7 +3898,7 @@ export interface components {
             frame: number;
             match: components["schemas"]["MatchDocument"] | null;
             outcome: string;
-            pose: components["schemas"]["PoseDocument"] | null;
+            pose: components["schemas"]["PlatePose"] | null;
             reason: string | null;
             scheme: string | null;
             side_px: number;
@@ -4136,6 +4084,39 @@ export interface components {
             lon_deg: number;
             source: string;
             speed_m_s: number | null;
+        };
+        FramesDecode: {
+            attempts: number;
+            codebook_plates?: number;
+            context: {
+                [key: string]: components["schemas"]["JsonValue"];
+            };
+            /** Format: date-time */
+            created_at: string;
+            decoder?: string;
+            error: components["schemas"]["ErrorDocument"] | null;
+            file_name: string | null;
+            finished_at: string | null;
+            fix?: components["schemas"]["FixDocument"] | null;
+            frames?: components["schemas"]["FrameDocument"][];
+            gaps?: components["schemas"]["GapDocument"][];
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "archive" | "frame" | "video";
+            links: components["schemas"]["DecodeLinks"];
+            partial?: boolean;
+            plates?: components["schemas"]["SeenPlateDocument"][];
+            progress: number;
+            readings?: (components["schemas"]["PlateReadingDocumentInFrame"] | components["schemas"]["FiducialReadingDocumentInFrame"])[];
+            receiver?: components["schemas"]["ReceiverPositions"] | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            summary?: components["schemas"]["FrameSummary"];
+            upload_bytes: number | null;
+            warnings?: string[];
         };
         FramesIn: {
             /** @default null */
@@ -4479,6 +4460,14 @@ export interface components {
             reason: string;
             what: string;
         };
+        LineCrossing: {
+            confidence: number;
+            lateral_cm: number;
+            odometer_m: number;
+            side: components["schemas"]["Side"];
+            style: components["schemas"]["LineStyle"];
+            t_s: number;
+        };
         LineIn: {
             /** @default 0 */
             from_m?: number;
@@ -4618,6 +4607,33 @@ export interface components {
             status?: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             tag?: components["schemas"]["TagIn"] | null;
         };
+        MagnetReading: {
+            along_std_m?: number | null;
+            /** @default 0 */
+            clearance_cm?: number;
+            confidence: number;
+            lateral_cm: number;
+            /**
+             * @default [
+             *       0,
+             *       0,
+             *       0
+             *     ]
+             */
+            moment_am2?: [
+                number,
+                number,
+                number
+            ];
+            odometer_m: number;
+            phi_deg: components["schemas"]["Orientation"];
+            polarity: components["schemas"]["Polarity"];
+            /** @default 0 */
+            relative_std_m?: number;
+            /** @default 0 */
+            snr?: number;
+            t_s: number;
+        };
         MaintenanceItem: {
             code: string | null;
             /** Format: date-time */
@@ -4722,6 +4738,10 @@ export interface components {
             registered: boolean;
             status: string | null;
         };
+        Meaning: {
+            kind: components["schemas"]["MeaningKind"];
+            value: number | string;
+        };
         MeaningDocument: {
             kind: string;
             text: string;
@@ -4732,6 +4752,8 @@ export interface components {
             kind: string;
             value: number | string;
         };
+        /** @enum {string} */
+        MeaningKind: "arrow" | "stop-line-ahead" | "speed-limit-kmh" | "speed-limit-mph" | "bend-left" | "bend-right" | "notice";
         MeaningsIn: {
             meanings: components["schemas"]["MeaningIn"][];
         };
@@ -4811,13 +4833,15 @@ export interface components {
             url: string;
             who: string;
         };
-        NoiseDocument: {
-            kind: string;
+        NoiseFinding: {
+            kind: components["schemas"]["NoiseKind"];
             lateral_cm: number;
             odometer_m: number;
             reason: string;
             t_s: number;
         };
+        /** @enum {string} */
+        NoiseKind: "ferrous-object" | "moment-unlike-a-magnet" | "not-on-the-road-surface" | "clearance-not-known" | "neither-upright-nor-forward" | "too-weak-to-be-sure" | "beside-the-bar" | "gap-in-the-trace" | "sensor-fault";
         NssdaDocument: {
             horizontal_95_m: number | null;
             is_tested: boolean;
@@ -4869,6 +4893,8 @@ export interface components {
             /** @default 10 */
             rate_hz?: number;
         };
+        /** @enum {integer} */
+        Orientation: 0 | 90;
         Origin: {
             lat_deg: number;
             lon_deg: number;
@@ -4928,6 +4954,37 @@ export interface components {
             };
             verify_ms: number;
             warnings: string[];
+        };
+        PacketsDecode: {
+            attempts: number;
+            context: {
+                [key: string]: components["schemas"]["JsonValue"];
+            };
+            /** Format: date-time */
+            created_at: string;
+            decoder?: string;
+            error: components["schemas"]["ErrorDocument"] | null;
+            file_name: string | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "packets";
+            lane?: components["schemas"]["DecodedLaneDocument"];
+            links: components["schemas"]["DecodeLinks"];
+            markers?: components["schemas"]["ReceivedMarkerDocument"][];
+            overlay?: components["schemas"]["OverlayDocument"] | null;
+            path_loss?: components["schemas"]["PathLossDocument"] | null;
+            progress: number;
+            receiver?: components["schemas"]["ReceiverPositions"] | null;
+            report?: components["schemas"]["PacketReportDocument"];
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            steering?: components["schemas"]["SteeringDocument"] | null;
+            summary?: components["schemas"]["PacketSummary"];
+            upload_bytes: number | null;
         };
         PacketsDocument: {
             entry: number[];
@@ -5004,16 +5061,6 @@ export interface components {
             /** @constant */
             method: "s3-parts";
             size: number;
-        };
-        PassedMagnetDocument: {
-            along_std_m?: number | null;
-            clearance_cm: number;
-            confidence: number;
-            lateral_cm: number;
-            odometer_m: number;
-            phi_deg: number;
-            polarity: string;
-            t_s: number;
         };
         PassFrameDocument: {
             ahead_m: number;
@@ -5282,7 +5329,7 @@ export interface components {
             thickness_mm: number;
             unit_mm: number;
         };
-        PlateGradeDocument: {
+        PlateGrade: {
             axial_nonuniformity: number;
             contrast: number;
             fixed_pattern: number;
@@ -5314,6 +5361,12 @@ export interface components {
              */
             status?: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
         };
+        PlatePose: {
+            covariance: number[][];
+            reprojection_rms_px: number;
+            rotation: number[][];
+            translation_m: number[];
+        };
         PlateReadingDocumentInFrame: {
             cell_confidence: number[];
             certainty: string | null;
@@ -5333,12 +5386,12 @@ export interface components {
             frame: number;
             from_codebook: boolean;
             geometry: components["schemas"]["ReadGeometryDocument"] | null;
-            grade: components["schemas"]["PlateGradeDocument"] | null;
+            grade: components["schemas"]["PlateGrade"] | null;
             height_px: number;
             likely_digits: string | null;
             match: components["schemas"]["MatchDocument"] | null;
             outcome: string;
-            pose: components["schemas"]["PoseDocument"] | null;
+            pose: components["schemas"]["PlatePose"] | null;
             possible_schemes: components["schemas"]["PossibleSchemeDocument"][];
             reason: string | null;
             registry_number: number | null;
@@ -5349,6 +5402,8 @@ export interface components {
             height_mm: number;
             width_mm: number;
         };
+        /** @enum {string} */
+        Polarity: "N" | "S";
         PolygonIn: {
             coordinates: number[][][];
             /**
@@ -5356,12 +5411,6 @@ export interface components {
              * @enum {string}
              */
             type: "Polygon";
-        };
-        PoseDocument: {
-            covariance: number[][];
-            reprojection_rms_px: number;
-            rotation: number[][];
-            translation_m: number[];
         };
         PosesIn: {
             /** @default null */
@@ -6233,6 +6282,8 @@ export interface components {
             height_mm: number;
             width_mm: number;
         };
+        /** @enum {string} */
+        Side: "left" | "right";
         SigmaDocument: {
             east_m: number;
             heading_deg: number;
@@ -6348,7 +6399,7 @@ export interface components {
             direction: "legal" | "wrong-way" | "unknown";
             end_s: number;
             extra: number;
-            fix: components["schemas"]["TagFixDocument"] | null;
+            fix: components["schemas"]["TagFix"] | null;
             gap_std_m: number[];
             gaps_m: number[];
             lateral_cm: number;
@@ -6362,12 +6413,12 @@ export interface components {
             tag: string | null;
             tuple: string | null;
         };
-        TagFixDocument: {
+        TagFix: {
             across_m: number;
             covariance: number[][];
             heading_deg: number;
             lat_deg: number;
-            localization_grade: string;
+            localization_grade: components["schemas"]["LocalizationGrade"];
             lon_deg: number;
             notes: string[];
             sigma: components["schemas"]["TagFixSigma"];
@@ -6398,7 +6449,7 @@ export interface components {
             ambiguous: boolean;
             localization_grade: string | null;
             marker_id: string | null;
-            meaning: components["schemas"]["CodeMeaningDocument"] | null;
+            meaning: components["schemas"]["Meaning"] | null;
             note: string | null;
             other_marker_ids: string[];
             registered: boolean;
@@ -6469,11 +6520,46 @@ export interface components {
             /** @default  */
             title?: string;
         };
-        TraceGapDocument: {
+        TraceDecode: {
+            attempts: number;
+            codebook_tags?: number;
+            context: {
+                [key: string]: components["schemas"]["JsonValue"];
+            };
+            /** Format: date-time */
+            created_at: string;
+            crossings?: components["schemas"]["LineCrossing"][];
+            decoder?: string;
+            error: components["schemas"]["ErrorDocument"] | null;
+            file_name: string | null;
+            finished_at: string | null;
+            fix?: components["schemas"]["TagFix"] | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "trace";
+            links: components["schemas"]["DecodeLinks"];
+            magnets?: components["schemas"]["MagnetReading"][];
+            motion?: components["schemas"]["TraceMotion"];
+            noise?: components["schemas"]["NoiseFinding"][];
+            progress: number;
+            report?: components["schemas"]["TraceReport"];
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            summary?: components["schemas"]["TraceSummary"];
+            tags?: components["schemas"]["TagDocument"][];
+            upload_bytes: number | null;
+        };
+        /** @enum {string} */
+        TraceFormat: "metro-stream" | "recorder-raw-data" | "recorder-speed" | "recorder-steering-wheel-angle" | "csv" | "parquet" | "can-log" | "dbc" | "bag";
+        TraceGap: {
             lost_s: number;
             part: string;
             sample: number;
-            skipped_bytes: number;
+            /** @default 0 */
+            skipped_bytes?: number;
             t_s: number;
         };
         TraceIn: {
@@ -6515,31 +6601,40 @@ export interface components {
             /** @default null */
             unit?: ("uT" | "nT" | "mT" | "gauss" | "mG") | null;
         };
-        TraceMotionDocument: {
+        TraceMotion: {
             heading_deg: (number | null)[];
             speed_m_s: (number | null)[];
             start_s: number;
             step_s: number;
         };
-        TraceReportDocument: {
-            clock_offsets_s: {
+        TraceReport: {
+            clock_offsets_s?: {
                 [key: string]: number;
             };
-            decode_ms: number;
-            driven_m: number;
-            duration_s: number;
-            formats: {
-                [key: string]: string;
+            /** @default 0 */
+            decode_ms?: number;
+            /** @default 0 */
+            driven_m?: number;
+            /** @default 0 */
+            duration_s?: number;
+            formats?: {
+                [key: string]: components["schemas"]["TraceFormat"];
             };
-            gap_count: number;
-            gaps: components["schemas"]["TraceGapDocument"][];
-            heading_coverage: number;
-            left_out: components["schemas"]["LeftOutRows"][];
-            load_ms: number;
-            rate_hz: number;
-            samples: number;
-            speed_coverage: number;
-            warnings: string[];
+            /** @default 0 */
+            gap_count?: number;
+            gaps?: components["schemas"]["TraceGap"][];
+            /** @default 0 */
+            heading_coverage?: number;
+            left_out?: components["schemas"]["LeftOutRows"][];
+            /** @default 0 */
+            load_ms?: number;
+            /** @default 0 */
+            rate_hz?: number;
+            /** @default 0 */
+            samples?: number;
+            /** @default 0 */
+            speed_coverage?: number;
+            warnings?: string[];
         };
         TraceSummary: {
             crossings: number;
