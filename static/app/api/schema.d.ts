@@ -3444,7 +3444,7 @@ export interface components {
             sigma_median_m: number | null;
             speed_limits_kmh: number[];
             stations: components["schemas"]["LaneStations"];
-            track_agreement: components["schemas"]["TrackAgreementDocument"] | null;
+            track_agreement: components["schemas"]["TrackAgreement"] | null;
         };
         DecodeDocument: components["schemas"]["FramesDecode"] | components["schemas"]["TraceDecode"] | components["schemas"]["PacketsDecode"];
         DecodeHead: {
@@ -3728,7 +3728,7 @@ export interface components {
             kind: string;
             limit?: string;
         };
-        EstimateDocument: {
+        Estimate: {
             high: number;
             low: number;
             value: number;
@@ -4391,6 +4391,14 @@ export interface components {
             vertical_datum?: string | null;
             vertical_rmse_m?: number | null;
         };
+        LaneInFrame: {
+            area_px: number[][][];
+            centre_px: number[][][];
+            frame: string;
+            left_px: number[][][];
+            markers_px: number[][];
+            right_px: number[][][];
+        };
         LaneProfile: {
             chainage_m: number[];
             curvature_per_m: number[];
@@ -4899,14 +4907,6 @@ export interface components {
             lat_deg: number;
             lon_deg: number;
         };
-        OverlayDocument: {
-            area_px: number[][][];
-            centre_px: number[][][];
-            frame: string;
-            left_px: number[][][];
-            markers_px: number[][];
-            right_px: number[][][];
-        };
         PackageIn: {
             crs?: string | null;
             /**
@@ -4975,8 +4975,8 @@ export interface components {
             lane?: components["schemas"]["DecodedLaneDocument"];
             links: components["schemas"]["DecodeLinks"];
             markers?: components["schemas"]["ReceivedMarkerDocument"][];
-            overlay?: components["schemas"]["OverlayDocument"] | null;
-            path_loss?: components["schemas"]["PathLossDocument"] | null;
+            overlay?: components["schemas"]["LaneInFrame"] | null;
+            path_loss?: components["schemas"]["PathLoss"] | null;
             progress: number;
             receiver?: components["schemas"]["ReceiverPositions"] | null;
             report?: components["schemas"]["PacketReportDocument"];
@@ -5075,11 +5075,12 @@ export interface components {
             read_rate: number;
             will_be_read: boolean;
         };
-        PathLossDocument: {
-            exponent: components["schemas"]["EstimateDocument"];
+        PathLoss: {
+            exponent: components["schemas"]["Estimate"];
             fitted_exponent: boolean;
-            level_at_50m_dbm: components["schemas"]["EstimateDocument"];
+            level_at_50m_dbm: components["schemas"]["Estimate"];
             packets: number;
+            sensitivity_dbm: number;
             spread_db: number;
         };
         PayloadDocument: {
@@ -6648,9 +6649,10 @@ export interface components {
             text: string;
             wrong_way: number;
         };
-        TrackAgreementDocument: {
+        TrackAgreement: {
             disagrees: boolean;
             east_m: number;
+            effect_m: number;
             north_m: number;
             scale_ppm: number;
             scale_sigma_ppm: number;
