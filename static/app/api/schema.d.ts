@@ -3083,7 +3083,7 @@ export interface components {
             jumped: boolean;
             offset_s: number;
             sigma_s: number;
-            state: string;
+            state: components["schemas"]["ClockState"];
             to_time: string | null;
         };
         ClockIn: {
@@ -3097,6 +3097,8 @@ export interface components {
             /** @default 0 */
             utc_offset_s?: number;
         };
+        /** @enum {string} */
+        ClockState: "reference" | "estimated" | "not-observable" | "declared" | "no-clock";
         CoarsePositionIn: {
             accuracy_m: number;
             lat_deg: number;
@@ -3623,19 +3625,26 @@ export interface components {
             self: string;
         };
         DriveMarker: {
-            across_m: number | null;
-            along_m: number | null;
+            /** @default null */
+            across_m?: number | null;
+            /** @default null */
+            along_m?: number | null;
             decode_id: string;
             detail: string | null;
-            distance: number | null;
+            /** @default null */
+            distance?: number | null;
             family: string;
-            lat_deg: number | null;
-            lon_deg: number | null;
+            /** @default null */
+            lat_deg?: number | null;
+            /** @default null */
+            lon_deg?: number | null;
             marker_id: string | null;
-            number: number | null;
+            /** @default null */
+            number?: number | null;
             place: number;
-            reason: string | null;
-            time: string | null;
+            reason: components["schemas"]["LeftOutReason"] | null;
+            /** @default null */
+            time?: string | null;
             used: boolean;
         };
         DriveOptionsIn: {
@@ -3655,19 +3664,11 @@ export interface components {
         DrivePage: {
             items: components["schemas"]["DriveHead"][];
         };
-        DriveReceiver: {
-            assumed_m: number;
-            clock: string;
-            decode_id: string;
-            left_out: number;
-            stated_m: number;
-            used: number;
-        };
         DriveReport: {
             clocks: components["schemas"]["ClockDocument"][];
             gaps: components["schemas"]["DriveGap"][];
             markers: components["schemas"]["DriveMarker"][];
-            receivers: components["schemas"]["DriveReceiver"][];
+            receivers: components["schemas"]["ReceiverResult"][];
             statistics: components["schemas"]["DriveStatistics"];
             summary: string;
             warnings: string[];
@@ -4462,6 +4463,8 @@ export interface components {
             reason: string;
             what: string;
         };
+        /** @enum {string} */
+        LeftOutReason: "outlier" | "no-time" | "no-position-grade" | "ambiguous-match" | "not-registered" | "implausible-match" | "status" | "no-fix" | "off-lane";
         LeftOutRows: {
             count: number;
             part: string;
@@ -5886,6 +5889,14 @@ export interface components {
             lat_deg: number[];
             lon_deg: number[];
             time_s: number[];
+        };
+        ReceiverResult: {
+            assumed_m: number;
+            clock: string;
+            decode_id: string;
+            left_out: number;
+            stated_m: number;
+            used: number;
         };
         RecommendationDocument: {
             battery_days: number;
