@@ -163,7 +163,7 @@ def decode_trace(
     from app.decoders.magnet.identify import match_tags
     from app.formats.format import SpooledFile
     from app.services.decodes.declarations import DeclaredTrace
-    from app.services.decodes.trace_documents import trace_document
+    from app.services.decodes.trace_documents import trace_result
     from app.services.decodes.trace_tasks import decode_recording
 
     terms = read_declaration(DeclaredTrace, declared, "docs/magnets.md")
@@ -171,5 +171,5 @@ def decode_trace(
     trace = match_tags(result.findings, (), terms.sensors)
     if plot is not None:
         plot.write_bytes(result.plot)
-    document = trace_document(result, trace, codebook_tags=0)
+    document = trace_result(result, trace, codebook_tags=0)
     typer.echo(orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY))

@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 import sqlalchemy as sa
 from pydantic import JsonValue
-from typing_extensions import TypedDict
 
 from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkOptions, Drawing, PlateReader
@@ -40,30 +39,6 @@ class ArtworkProof:
 
     digits: str
     confidence: float
-
-
-# === Parts of readings as clients see them, which every family has.
-
-
-class PoseDocument(TypedDict):
-    """Pose of a marker in the camera frame; the covariance is of rotation vector [rad] and translation [m]."""
-
-    rotation: list[list[float]]
-    translation_m: list[float]
-    covariance: list[list[float]]
-    reprojection_rms_px: float
-
-
-def pose_document(pose: PlatePose | None) -> PoseDocument | None:
-    """A pose, if there is one."""
-    if pose is None:
-        return None
-    return {
-        "rotation": pose.rotation.tolist(),
-        "translation_m": pose.translation_m.tolist(),
-        "covariance": pose.covariance.tolist(),
-        "reprojection_rms_px": float(pose.reprojection_rms_px),
-    }
 
 
 def rounded(values: npt.NDArray[np.float64] | None, places: int) -> list[list[float]] | None:

@@ -37,11 +37,9 @@ from app.families.family import (
     Match,
     Nearby,
     Pixels,
-    PoseDocument,
     Registration,
     map_point,
     nearest_match,
-    pose_document,
     rounded,
 )
 from app.families.surveys import (
@@ -58,6 +56,7 @@ from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import PlacedPosition
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting, get_dictionary
+from app.markers.reading import PlatePose
 from app.planning.outputs.hd_map import MapMarker
 from app.registry import markers as store
 from app.registry.bulk_load import Columns
@@ -236,7 +235,7 @@ class FiducialReadingDocument(TypedDict):
     contrast: float
     corners_px: list[list[float]]
     side_px: float
-    pose: PoseDocument | None
+    pose: PlatePose | None
 
 
 class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
@@ -284,7 +283,7 @@ class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
             "contrast": round(float(reading.contrast), 1),
             "corners_px": rounded(reading.corners_px, 3) or [],
             "side_px": round(float(reading.side_px), 2),
-            "pose": pose_document(reading.pose),
+            "pose": reading.pose,
         }
 
     def observation(self, reading: FiducialReading) -> dict[str, Any]:

@@ -19,7 +19,19 @@ from app.lanes.smooth_line import (
     plane_from_wgs84,
     wgs84_from_plane,
 )
-from app.lanes.types import UNKNOWN, Bools, Floats, Ints, Lane, LaneRules, LeftOutReason, Notes, TrackAgreement
+from app.lanes.types import (
+    MAX_TRACK_SIGNIFICANCE,
+    MIN_TRACK_EFFECT_M,
+    UNKNOWN,
+    Bools,
+    Floats,
+    Ints,
+    Lane,
+    LaneRules,
+    LeftOutReason,
+    Notes,
+    TrackAgreement,
+)
 from app.sensors.pose_track import PoseTrack
 
 _MAX_WIDTH_SIGMA_M = 0.3  # [m] a width that is less certain is not published; an eighth of narrow lanes
@@ -376,6 +388,8 @@ def _agreement(
     moved = _transformed(compared.fix_m, middle_m, values) - compared.fix_m
     across = np.sum(moved * compared.normal, 1)
     alone = max(shift_z, abs(turn) / turn_sigma, abs(scale) / scale_sigma)
+    significance = max(alone, _joint_significance(values[:4], covariance[:4, :4] + receiver))
+    effect_m = float(np.sqrt(np.mean(across**2)))
     return TrackAgreement(
         east_m=float(shift[0]),
         north_m=float(shift[1]),
@@ -384,8 +398,9 @@ def _agreement(
         turn_sigma_deg=math.degrees(turn_sigma),
         scale_ppm=1e6 * scale,
         scale_sigma_ppm=1e6 * scale_sigma,
-        significance=max(alone, _joint_significance(values[:4], covariance[:4, :4] + receiver)),
-        effect_m=float(np.sqrt(np.mean(across**2))),
+        significance=significance,
+        effect_m=effect_m,
+        disagrees=significance > MAX_TRACK_SIGNIFICANCE and effect_m > MIN_TRACK_EFFECT_M,
     )
 
 

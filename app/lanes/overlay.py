@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
 from app.sensors.camera import Camera
@@ -78,6 +79,17 @@ class LineInFrame:
     pieces_px: tuple[Floats, ...]
 
 
+class LaneInFrame(TypedDict):
+    """Pixel coordinates of the lane in the camera frame."""
+
+    frame: str
+    left_px: list[list[list[float]]]
+    right_px: list[list[list[float]]]
+    centre_px: list[list[list[float]]]
+    area_px: list[list[list[float]]]
+    markers_px: list[list[float]]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneOverlay:
     """A lane in a frame."""
@@ -87,6 +99,21 @@ class LaneOverlay:
     centre: LineInFrame
     area_px: tuple[Floats, ...]  # shape (M, 2): [px] polygons between the boundaries, within the frame
     markers: PointsInFrame
+
+    def visible(self, frame: str = "") -> LaneInFrame:
+        """What is to be drawn over the frame of this name."""
+
+        def listed(pieces: tuple[Floats, ...]) -> list[list[list[float]]]:
+            return [np.round(piece, 2).tolist() for piece in pieces]
+
+        return {
+            "frame": frame,
+            "left_px": listed(self.left.pieces_px),
+            "right_px": listed(self.right.pieces_px),
+            "centre_px": listed(self.centre.pieces_px),
+            "area_px": listed(self.area_px),
+            "markers_px": np.round(self.markers.points_px[self.markers.visible], 2).tolist(),
+        }
 
 
 def ned_from_enu(points_enu_m: npt.ArrayLike) -> Floats:

@@ -34,7 +34,7 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 MAX_TRACK_SIGNIFICANCE = 4.5  # standard deviations above which path and track disagree; 1 in 150,000
-_MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; a lane leaves as much room
+MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; a lane leaves as much room
 UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, LaneSide.RIGHT))
 
 
@@ -141,7 +141,10 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class TrackAgreement:
-    """The transformation that brings a vehicle's track onto a path, with standard deviations."""
+    """How the path lies against the vehicle's track, beyond what driver and receiver explain where it disagrees.
+
+    It is the transformation that brings the track onto the path.
+    """
 
     # `east_m`, `north_m`: [m] shift of the markers' path against the track
     east_m: float
@@ -156,11 +159,7 @@ class TrackAgreement:
     # of shift, turn and scale, together or of one of them alone, whichever is larger. In standard deviations.
     significance: float
     effect_m: float  # [m] how far the transformation moves the track, across the path, RMS
-
-    @property
-    def disagrees(self) -> bool:
-        """Whether the path may not be trusted."""
-        return self.significance > MAX_TRACK_SIGNIFICANCE and self.effect_m > _MIN_TRACK_EFFECT_M
+    disagrees: bool  # the path may not be trusted
 
     @property
     def reason(self) -> str:

@@ -465,13 +465,7 @@ _NUMBERS: dict[MeaningKind, tuple[str, float, float]] = {
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """A kind and its value.
-
-    Raises
-    ------
-    InvalidParameter
-        The value does not belong to the kind.
-    """
+    """The meaning of a code."""
 
     kind: MeaningKind
     # a number in the kind's unit (distance to the stop line [m], speed limit, angle of the bend [deg]), the `Arrow`, or

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import GetPydanticSchema
 
 from app.geodesy import UNFIT_TEXT, LocalizationGrade
 from app.markers.plate import PlateCode, PlateGeometry
+
+# === Arrays in results, which JSON has as lists.
+
+
+Vector = Annotated[npt.NDArray[np.float64], GetPydanticSchema(lambda _, schema_of: schema_of(list[float]))]
+Matrix = Annotated[npt.NDArray[np.float64], GetPydanticSchema(lambda _, schema_of: schema_of(list[list[float]]))]
+
 
 # === Status of a marker: from the plan to the end of its use.
 
@@ -133,13 +141,13 @@ class Certainty(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlatePose:
-    """Pose of a plate in the camera frame (OpenCV: x right, y down, z forward)."""
+    """Pose of a marker in the camera frame; the covariance is of rotation vector [rad] and translation [m]."""
 
-    # shape (3, 3): camera_from_plate; plate axes x right, y travel, z up out of the road
-    rotation: npt.NDArray[np.float64]
-    translation_m: npt.NDArray[np.float64]  # shape (3,): [m] plate centre in the camera frame
-    # shape (6, 6): of (rotation vector [rad] about the camera's axes, translation [m])
-    covariance: npt.NDArray[np.float64]
+    # shape (3, 3): camera_from_plate; plate axes x right, y travel, z up out of the road; those of the camera are
+    # OpenCV's: x right, y down, z forward
+    rotation: Matrix
+    translation_m: Vector  # shape (3,): [m] plate centre in the camera frame
+    covariance: Matrix  # shape (6, 6): the rotation vector is about the camera's axes
     reprojection_rms_px: float  # [px] root mean square of the corners' residuals
 
 
@@ -150,6 +158,7 @@ class PlateGrade:
     The overall grade is the lowest of its parts.
     """
 
+    letter: str  # A, B, C, D or F
     overall: float
     contrast: float
     modulation: float
@@ -157,11 +166,6 @@ class PlateGrade:
     axial_nonuniformity: float
     grid_nonuniformity: float
     unused_correction: float
-
-    @property
-    def letter(self) -> str:
-        """A, B, C, D or F."""
-        return "FDCBA"[int(self.overall)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.lanes.overlay import LaneOverlay
+from app.lanes.overlay import LaneInFrame
 
 _BGR = {"read": (80, 220, 60), "unsure": (40, 190, 250), "not-in-registry": (40, 190, 250)}
 _REFUSED_BGR = (90, 90, 240)
 _DARK_BGR = (25, 25, 25)
 _LANE_BGR, _LANE_SHARE = (90, 200, 70), 0.32
-_LINE_BGR = {"left": (235, 160, 60), "right": (60, 170, 245), "centre": (245, 245, 245)}
+_LEFT_BGR, _RIGHT_BGR, _CENTRE_BGR = (235, 160, 60), (60, 170, 245), (245, 245, 245)
 _MARKER_BGR = (60, 230, 250)
 
 
@@ -52,13 +52,13 @@ def draw_outlines(pixels: npt.NDArray[np.uint8], outlines: Sequence[Outline]) ->
     return canvas
 
 
-def draw_lane(pixels: npt.NDArray[np.uint8], overlay: LaneOverlay) -> npt.NDArray[np.uint8]:
+def draw_lane(pixels: npt.NDArray[np.uint8], lane: LaneInFrame) -> npt.NDArray[np.uint8]:
     """A frame with the lane over it: its area green, left boundary blue, right boundary orange, centre line white.
 
     Parameters
     ----------
     pixels : ndarray of uint8, shape (H, W, 3) BGR or (H, W) grey
-    overlay : LaneOverlay
+    lane : LaneInFrame
         Of a camera with this frame's size.
 
     Returns
@@ -68,24 +68,28 @@ def draw_lane(pixels: npt.NDArray[np.uint8], overlay: LaneOverlay) -> npt.NDArra
     """
     canvas = np.array(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if pixels.ndim == 2 else pixels, dtype=np.uint8)
     scale = max(min(canvas.shape[:2]) / 1080, 0.4)
-    if overlay.area_px:
+    if lane["area_px"]:
         filled = canvas.copy()
-        for polygon in overlay.area_px:
+        for polygon in lane["area_px"]:
             cv2.fillPoly(filled, [_fixed(polygon)], _LANE_BGR, cv2.LINE_AA, 4)
         cv2.addWeighted(filled, _LANE_SHARE, canvas, 1 - _LANE_SHARE, 0, dst=canvas)
-    for name, thick in (("centre", 2), ("left", 4), ("right", 4)):
-        pieces = [_fixed(piece) for piece in getattr(overlay, name).pieces_px]
+    for line, colour, thick in (
+        (lane["centre_px"], _CENTRE_BGR, 2),
+        (lane["left_px"], _LEFT_BGR, 4),
+        (lane["right_px"], _RIGHT_BGR, 4),
+    ):
+        pieces = [_fixed(piece) for piece in line]
         cv2.polylines(canvas, pieces, False, _DARK_BGR, max(4, round((thick + 3) * scale)), cv2.LINE_AA, 4)
-        cv2.polylines(canvas, pieces, False, _LINE_BGR[name], max(2, round(thick * scale)), cv2.LINE_AA, 4)
-    for u, v in _fixed(overlay.markers.points_px[overlay.markers.visible]).reshape(-1, 2).tolist():
+        cv2.polylines(canvas, pieces, False, colour, max(2, round(thick * scale)), cv2.LINE_AA, 4)
+    for u, v in _fixed(lane["markers_px"]).reshape(-1, 2).tolist():
         cv2.circle(canvas, (u, v), round(8 * scale) * 16, _DARK_BGR, cv2.FILLED, cv2.LINE_AA, 4)
         cv2.circle(canvas, (u, v), round(5 * scale) * 16, _MARKER_BGR, cv2.FILLED, cv2.LINE_AA, 4)
     return canvas
 
 
-def _fixed(points_px: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
+def _fixed(points_px: list[list[float]]) -> npt.NDArray[np.int32]:
     """OpenCV's points in sixteenths of a pixel."""
-    return np.asarray(np.round(points_px * 16), np.int32).reshape(-1, 1, 2)
+    return np.asarray(np.round(np.asarray(points_px) * 16), np.int32).reshape(-1, 1, 2)
 
 
 def encode_picture(pixels: npt.NDArray[np.uint8], suffix: str) -> bytes:

@@ -166,7 +166,7 @@ def _tags(tags: Sequence[TagReading], along: Scale) -> list[str]:
 def _magnet(magnet: MagnetReading, x: float, y: float) -> str:
     colour = _COLOURS[magnet.polarity]
     title = f"{magnet.polarity} {magnet.phi_deg} deg, {magnet.lateral_cm:.1f} cm, {magnet.confidence:.3f}"
-    if magnet.orientation is Orientation.UP:
+    if magnet.phi_deg is Orientation.UP:
         return circle(x, y, 4, colour, title)
     tip = 5 if magnet.polarity is Polarity.N else -5
     path = f"M{x - tip:.1f} {y - 5:.1f}L{x + tip:.1f} {y:.1f}L{x - tip:.1f} {y + 5:.1f}z"

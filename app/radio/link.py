@@ -120,7 +120,7 @@ _MIN_CORRELATED = 30  # pairs of packets to estimate their correlation
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value with its 95 % interval."""
+    """An estimate with its interval of 95 %."""
 
     value: float
     low: float
@@ -129,9 +129,9 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class PathLoss:
-    """RSSI = level - 10 exponent log10(distance / 50 m), with a normal spread about it."""
+    """The fitted path loss: RSSI = level - 10 exponent log10(distance / 50 m), with a normal spread about it."""
 
-    level_dbm: Estimate  # [dBm] at 50 m
+    level_at_50m_dbm: Estimate
     exponent: Estimate
     spread_db: float  # [dB] standard deviation of shadows and fading
     sensitivity_dbm: float  # [dBm] half of the packets of this strength are received; a guess if all were much stronger
@@ -141,11 +141,11 @@ class PathLoss:
     @property
     def at_1m_dbm(self) -> float:
         """Of the line at 1 m, for drawing. [dBm]"""
-        return self.level_dbm.value + 10 * self.exponent.value * math.log10(NEAR_M)
+        return self.level_at_50m_dbm.value + 10 * self.exponent.value * math.log10(NEAR_M)
 
     def rssi_dbm(self, distance_m: npt.ArrayLike) -> Floats:
         """Of the line. [dBm]"""
-        return self.level_dbm.value - self.exponent.value * _decades_db(np.asarray(distance_m, float))
+        return self.level_at_50m_dbm.value - self.exponent.value * _decades_db(np.asarray(distance_m, float))
 
 
 def fit_path_loss(
@@ -236,7 +236,7 @@ def fit_offset(
     count = (len(rssi_dbm) + len(missed_m)) / widened
     limit = float(scipy.special.stdtrit(max(count - 1, 1), 0.975)) ** 2 * widened / 2
     within = grid[total >= total[best] - limit]
-    line_db = (line.level_dbm.high - line.level_dbm.low) / 4
+    line_db = (line.level_at_50m_dbm.high - line.level_at_50m_dbm.low) / 4
     low = grid[best] - math.hypot(grid[best] - within[0], 2 * line_db)
     high = grid[best] + math.hypot(within[-1] - grid[best], 2 * line_db)
     return Estimate(float(grid[best]), float(low), float(high))

@@ -380,4 +380,4 @@ def _temporary(error: Exception) -> Unavailable | None:
 
 
 def _json(value: object) -> str:
-    return orjson.dumps(value).decode()
+    return orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY).decode()

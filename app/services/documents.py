@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import replace
 from enum import StrEnum
 from typing import NotRequired, TypeVar, cast
 
+import numpy as np
+import numpy.typing as npt
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, WaymarkError
@@ -26,6 +31,24 @@ def document_of(document: type[DocumentT], source: object, **others: object) -> 
     """
     names = document.__annotations__
     return cast(DocumentT, {name: others[name] if name in others else getattr(source, name) for name in names})
+
+
+def rounded(source: DocumentT, places: Mapping[str, int]) -> DocumentT:
+    """A dataclass with its numbers rounded to so many places, by the names of their fields: long lists take less."""
+    values: dict[str, object] = {}
+    for name in source.__dataclass_fields__.keys() & places.keys():  # type: ignore[attr-defined]
+        value = getattr(source, name)
+        if isinstance(value, tuple):
+            values[name] = tuple(round(one, places[name]) for one in value)
+        elif value is not None:
+            values[name] = round(value, places[name])
+    return replace(source, **values)  # type: ignore[type-var]
+
+
+def listed(values: npt.ArrayLike, places: int) -> list[float | None]:
+    """Numbers of a column, rounded; None for those that are not finite."""
+    column: list[float] = (np.round(np.asarray(values, float), places) + 0.0).tolist()  # no negative zero
+    return [value if math.isfinite(value) else None for value in column]
 
 
 # === Errors as parts of results: why a job failed, or why a file of an archive cannot be used.

@@ -186,7 +186,7 @@ def _in_time_order(given: TrackInput, clocks: dict[str, Clock]) -> tuple[Positio
         sorted(
             given.fixes,
             key=lambda fix: (
-                fix.time_s + clocks[fix.clock].offset_s, fix.clock, fix.source, fix.place, fix.marker_id or "",
+                fix.time_s + clocks[fix.clock].offset_s, fix.clock, fix.decode_id, fix.place, fix.marker_id or "",
                 fix.lon_deg, fix.lat_deg,
             ),
         )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from app.tracks.types import FixResult, Floats, Ints, Track
+from app.tracks.types import DriveMarker, FixResult, Floats, Ints, Track
 
 CSV_COLUMNS = (
     "time", "lon_deg", "lat_deg", "heading_deg", "speed_m_s", "variance_east_m2", "covariance_east_north_m2",
@@ -35,14 +35,8 @@ def write_csv(track: Track) -> str:
     return "\r\n".join(rows) + "\r\n"
 
 
-def write_geojson(track: Track, name: str, others: Sequence[dict[str, Any]] = ()) -> str:
-    """The track as lines, the positions of fixes as points.
-
-    Parameters
-    ----------
-    others : sequence of dict
-        Markers that gave no fix: features without a geometry.
-    """
+def write_geojson(track: Track, name: str, markers: Sequence[DriveMarker] = ()) -> str:
+    """The track as lines, its markers as points; those that gave no fix have no geometry."""
     features: list[dict[str, object]] = []
     stamps = time_texts(track.time_s)
     for part in stretches(track):
@@ -61,15 +55,14 @@ def write_geojson(track: Track, name: str, others: Sequence[dict[str, Any]] = ()
                 "heading_sigma_deg": np.round(track.heading_sigma_deg[part], 4).tolist(),
             },
         })  # fmt: skip
-    features += [_fix_feature(result) for result in track.fixes]
-    features += [{"type": "Feature", "geometry": None, "properties": {"kind": "marker", **other}} for other in others]
+    features += [_marker_feature(marker) for marker in markers]
     return json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), allow_nan=False)
 
 
 def write_gpx(track: Track, name: str) -> str:
     """One segment for each stretch without a gap; markers that were used are waypoints."""
     waypoints = [
-        f'<wpt lat="{result.fix.lat_deg:.9f}" lon="{result.fix.lon_deg:.9f}"><time>{_time_text(result.time_s)}</time>'
+        f'<wpt lat="{result.fix.lat_deg:.9f}" lon="{result.fix.lon_deg:.9f}"><time>{time_text(result.time_s)}</time>'
         f"<name>{escape(result.fix.marker_id or result.fix.clock)}</name><type>{escape(result.fix.family)}</type></wpt>"
         for result in track.fixes
         if result.used
@@ -134,7 +127,8 @@ def time_texts(time_s: Floats) -> list[str]:
     return [f"{stamp}Z" for stamp in stamps.tolist()]
 
 
-def _time_text(seconds: float) -> str:
+def time_text(seconds: float) -> str:
+    """A time in UTC, RFC 3339 with milliseconds."""
     return datetime.fromtimestamp(round(seconds, 3), UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
@@ -143,22 +137,28 @@ def _coordinates(lon_deg: Floats, lat_deg: Floats) -> list[list[float]]:
     return pairs
 
 
-def _fix_feature(result: FixResult) -> dict[str, object]:
+def fix_marker(result: FixResult) -> DriveMarker:
+    """A marker that gave a fix."""
     fix = result.fix
-    return {
-        "type": "Feature",
-        "geometry": {"type": "Point", "coordinates": [round(fix.lon_deg, 9), round(fix.lat_deg, 9)]},
-        "properties": {
-            "kind": "marker",
-            "marker_id": fix.marker_id,
-            "family": fix.family,
-            "decode_id": fix.source,
-            "place": fix.place,
-            "time": _time_text(result.time_s),
-            "used": result.used,
-            "reason": str(result.reason) if result.reason is not None else None,
-            "distance": round(result.distance, 3),
-            "along_m": round(result.along_m, 3),
-            "across_m": round(result.across_m, 3),
-        },
-    }
+    return DriveMarker(
+        fix.marker_id,
+        fix.family,
+        fix.decode_id,
+        fix.place,
+        result.used,
+        result.reason,
+        None if result.used else f"{result.distance:.1f} standard deviations from the track by all others",
+        time=time_text(result.time_s),
+        lon_deg=fix.lon_deg,
+        lat_deg=fix.lat_deg,
+        distance=round(result.distance, 3),
+        along_m=round(result.along_m, 3),
+        across_m=round(result.across_m, 3),
+    )
+
+
+def _marker_feature(marker: DriveMarker) -> dict[str, object]:
+    properties = asdict(marker)
+    lon_deg, lat_deg = properties.pop("lon_deg"), properties.pop("lat_deg")
+    point = None if lon_deg is None else {"type": "Point", "coordinates": [round(lon_deg, 9), round(lat_deg, 9)]}
+    return {"type": "Feature", "geometry": point, "properties": {"kind": "marker", **properties}}

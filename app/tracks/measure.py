@@ -353,7 +353,7 @@ def with_estimated_accuracy(
     upper = np.array([[0, 1], [1, 2]])
     own = arrays.cov_m2[:, upper]
     off, spread = by_markers.offset_m[:, :2], by_markers.spread[:, :2, :2]
-    sources = np.array([fix.source if fix.marker_id is None else "" for fix in fixes])
+    sources = np.array([fix.decode_id if fix.marker_id is None else "" for fix in fixes])
     receiver = is_receiver(fixes)
     for source in dict.fromkeys(sources[receiver].tolist()):
         members = np.flatnonzero(receiver & (sources == source))
@@ -372,8 +372,8 @@ def with_estimated_accuracy(
 def receiver_results(fixes: tuple[PositionFix, ...], factor: Floats, used: Bools) -> tuple[ReceiverResult, ...]:
     """What became of the positions of each source."""
     found = []
-    for source in dict.fromkeys(fix.source for fix in fixes if fix.marker_id is None):
-        members = [k for k, fix in enumerate(fixes) if fix.marker_id is None and fix.source == source]
+    for source in dict.fromkeys(fix.decode_id for fix in fixes if fix.marker_id is None):
+        members = [k for k, fix in enumerate(fixes) if fix.marker_id is None and fix.decode_id == source]
         stated = float(np.median([math.sqrt(fixes[k].covariance_m2[0] + fixes[k].covariance_m2[2]) for k in members]))
         count = int(used[members].sum())
         widened = math.sqrt(float(factor[members[0]]))

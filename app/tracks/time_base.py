@@ -57,7 +57,7 @@ def split_where_time_falls(
     found, segment_of = 0, segment_of.copy()
     by_source: dict[tuple[str, str], list[int]] = {}
     for k, fix in enumerate(fixes):
-        by_source.setdefault((fix.clock, fix.source), []).append(k)
+        by_source.setdefault((fix.clock, fix.decode_id), []).append(k)
     for members in by_source.values():
         rows = np.array(sorted(members, key=lambda k: (fixes[k].place, fixes[k].time_s)))
         place = np.array([fixes[k].place for k in rows])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -80,8 +81,8 @@ class PositionFix:
     common_m2: float = 0.0  # [m2] part of the variance of each axis that all fixes by the same marker share: its survey
     marker_id: str | None = None  # None for a position of the vehicle's own receiver
     family: str = ""
-    source: str = ""  # what it was read from, e.g. the id of a decode.
-    place: int = 0  # index in the source, e.g. of the frame.
+    decode_id: str = ""
+    place: int = 0  # index in the decode, e.g. of the frame
     heading_cross_m_rad: tuple[float, float] = (0.0, 0.0)  # [m rad] covariances of the heading with east and north
 
     def __post_init__(self) -> None:
@@ -89,7 +90,7 @@ class PositionFix:
         finite = all(math.isfinite(value) for value in (self.time_s, self.lon_deg, self.lat_deg, east, cross, north))
         if not finite or abs(self.lat_deg) > MAX_LAT_DEG or abs(self.lon_deg) > 360 or east * north <= cross * cross:
             raise InvalidParameter(
-                f"a fix of {self.source or self.clock} has no place, no time or no covariance",
+                f"a fix of {self.decode_id or self.clock} has no place, no time or no covariance",
                 field="fixes",
                 limit=f"finite numbers, latitudes to {MAX_LAT_DEG:g} deg, a positive definite covariance",
             )
@@ -122,7 +123,7 @@ class Samples:
 class LanePath:
     """A lane's path: where it leads is known, not when it was driven."""
 
-    source: str
+    decode_id: str
     # `lon_deg`, `lat_deg`: shape (N,): [deg] in the direction of travel
     lon_deg: Floats
     lat_deg: Floats
@@ -184,18 +185,35 @@ class FixResult:
 
 
 @dataclass(frozen=True, slots=True)
-class ReceiverResult:
-    """What became of the positions of one receiver."""
+class DriveMarker:
+    """A marker of a drive: used, or left out and why."""
 
-    source: str
+    marker_id: str | None
+    family: str
+    decode_id: str
+    place: Annotated[int, Field(description="Frame of an archive, tag of a trace, marker of a packet log.")]
+    used: bool
+    reason: LeftOutReason | None
+    detail: str | None
+    number: Annotated[int | None, Field(description="Of a CERPM.")] = None
+    time: str | None = None
+    lon_deg: float | None = None
+    lat_deg: float | None = None
+    distance: Annotated[float | None, Field(description="Mahalanobis distance to the track by all others.")] = None
+    along_m: Annotated[float | None, Field(description="From that track, forward positive.")] = None
+    across_m: Annotated[float | None, Field(description="From that track, left positive.")] = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReceiverResult:
+    """Positions of the vehicle's own receiver, of one decode."""
+
+    decode_id: str
     clock: str
-    # `used`, `left_out`: positions
     used: int
-    left_out: int
-    # `stated_m`, `assumed_m`: [m] median of their stated standard deviations, both axes together, and what the markers
-    # show of it
-    stated_m: float
-    assumed_m: float
+    left_out: Annotated[int, Field(description="Too far from the track by all others.")]
+    stated_m: Annotated[float, Field(description="Median of the standard deviations that the receiver states.")]
+    assumed_m: Annotated[float, Field(description="The same, enlarged to what the markers show of it.")]
 
 
 @dataclass(frozen=True, slots=True)

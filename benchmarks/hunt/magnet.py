@@ -209,11 +209,11 @@ def _judge(p: Parameters, drive: SimulatedDrive, findings: Sequence[Finding]) ->
             continue
         taken.add(near)
         magnet = drive.magnets[near]
-        right = reading.polarity is magnet.polarity and reading.orientation is magnet.orientation
+        right = reading.polarity is magnet.polarity and reading.phi_deg is magnet.orientation
         sure.append((reading.confidence, right))
         if not right and reading.confidence >= SURE:
-            wrong.append("wrong polarity" if reading.orientation is magnet.orientation else "wrong axis")
-        elif right and reading.along_std_m > 0:
+            wrong.append("wrong polarity" if reading.phi_deg is magnet.orientation else "wrong axis")
+        elif right and reading.along_std_m:
             squared.append((((reading.t_s - magnet.t_s) * magnet.speed_m_s / reading.along_std_m) ** 2, 1))
     wrong += ["wrong tag"] * _wrong_tags(drive, findings)
     if wrong:

@@ -60,7 +60,7 @@ def score_magnets(drive: SimulatedDrive, findings: Sequence[Finding], only: Orie
             continue
         used.add(k)
         reading = readings[k]
-        if reading.polarity is magnet.polarity and reading.orientation is magnet.orientation:
+        if reading.polarity is magnet.polarity and reading.phi_deg is magnet.orientation:
             tally.found += 1
             tally.lateral_cm.append(reading.lateral_cm - magnet.lateral_cm)
         else:

@@ -167,7 +167,7 @@ def _with_sensors(
                 math.degrees(lon[k] + error[0] / east_per[0]), math.degrees(lat[k] + error[1] / north_per[0]),
                 (float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])),
                 (math.degrees(psi[k]) + rng.normal(0, heading_s)) % 360, heading_s,
-                common_m2=survey_s**2, marker_id=marker, family=family, source=family, place=len(fixes),
+                common_m2=survey_s**2, marker_id=marker, family=family, decode_id=family, place=len(fixes),
             )
         )  # fmt: skip
 

@@ -15,7 +15,7 @@ HERE = VehiclePose((0.0, 0.0, 0.0), 0.0)
 def overlay(first_m=-20.0, last_m=90.0, markers=()):
     north = np.linspace(first_m, last_m, 30)
     sides = [np.column_stack([north, np.full(30, east), np.zeros(30)]) for east in (-1.75, 1.75, 0.0)]
-    return lane_in_frame(*sides, pose=HERE, camera=CAMERA, markers_ned_m=markers)
+    return lane_in_frame(*sides, pose=HERE, camera=CAMERA, markers_ned_m=markers).visible()
 
 
 def row_at(ahead_m: float) -> int:

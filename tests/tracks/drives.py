@@ -70,7 +70,7 @@ class Recording:
     def see(
         self, at_s: float, *, clock: str = "camera", late_s: float = 0.0, off_m: tuple[float, float] = (0.0, 0.0),
         sigma_m: float = 0.08, marker: str | None = None, heading: bool = True,
-        source: str = "",
+        decode_id: str = "",
     ) -> None:  # fmt: skip
         """A fix `at_s` after the start; the clock is `late_s` behind; a wrong one is `off_m` away."""
         k = min(round(at_s / STEP_S), len(self.truth.time_s) - 1)
@@ -86,7 +86,7 @@ class Recording:
                 math.degrees(self.truth.lat[k] + error[1] / north), (sigma_m**2, 0.0, sigma_m**2),
                 math.degrees(self.truth.heading[k]) % 360 + self.rng.normal(0, 0.5) if heading else math.nan,
                 0.5 if heading else math.nan, 0.0, marker or f"m{number}", "plate",
-                source or f"picture {number}", number,
+                decode_id or f"picture {number}", number,
             )
         )  # fmt: skip
 
@@ -94,7 +94,7 @@ class Recording:
         """Fixes at even times."""
         last = min(end_s, float(self.truth.time_s[-1] - self.truth.time_s[0]) - 1.0)
         for at in np.arange(start_s, last, every_s):
-            self.see(float(at), **{"source": "upload", **more})  # type: ignore[arg-type]
+            self.see(float(at), **{"decode_id": "upload", **more})  # type: ignore[arg-type]
         return self
 
     def track_input(

@@ -31,7 +31,7 @@ def positions(
             PositionFix(
                 "receiver", T0_S + at_s - late_s, math.degrees(lon + (error[0] + bias_m[0]) / east),
                 math.degrees(lat + (error[1] + bias_m[1]) / north), (sigma_m**2, 0.0, sigma_m**2),
-                source="log", place=number,
+                decode_id="log", place=number,
             )
         )  # fmt: skip
     return tuple(found)

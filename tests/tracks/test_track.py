@@ -263,7 +263,7 @@ def test_a_wrong_marker_is_left_out_with_all_its_frames() -> None:
     for number, at in enumerate(np.arange(4.0, 84.0, 8.0)):
         off = (2.5, -2.0) if number == 5 else (0.0, 0.0)
         for later in (0.0, 0.2, 0.4):  # any two of them agree with the third
-            seen.see(float(at) + later, off_m=off, marker=f"plate {number}", source="upload")
+            seen.see(float(at) + later, off_m=off, marker=f"plate {number}", decode_id="upload")
     track = estimate_track(seen.track_input())
     assert len(seen.wrong) == 3
     assert seen.left_out(track) == seen.wrong

@@ -90,7 +90,8 @@ def document_response(model: object, *problems: int, status: int = 200, descript
 
 def json_response(content: object, status: int = 200, headers: dict[str, str] | None = None) -> Response:
     """A JSON response, serialised by orjson."""
-    return Response(orjson.dumps(content), status, headers, media_type="application/json")
+    text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
+    return Response(text, status, headers, media_type="application/json")
 
 
 def page_response(request: Request, page: object, **cursor: str | int | None) -> Response:

@@ -553,7 +553,7 @@ class TagAssembler:
 
     def add(self, magnet: PlacedMagnet) -> list[LineCrossing | TagReading]:
         """Findings that a further magnet completes."""
-        if magnet.reading.orientation is Orientation.UP:
+        if magnet.reading.phi_deg is Orientation.UP:
             return self._cross(magnet.reading)
         found = self.pass_by(magnet.reading.odometer_m)
         self._row.append(magnet)

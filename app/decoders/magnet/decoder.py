@@ -242,7 +242,7 @@ class MagnetDecoder:
             odometer_m=s,
             lateral_cm=lateral_cm,
             polarity=classification.polarity,
-            orientation=classification.orientation,
+            phi_deg=classification.orientation,
             confidence=classification.confidence,
             clearance_cm=100 * h,
             moment_am2=(float(m[0]), float(m[1]), float(m[2])),

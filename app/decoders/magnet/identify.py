@@ -24,6 +24,7 @@ from app.geodesy import LocalizationGrade, enu_from_wgs84, wgs84_from_enu
 from app.inputs import Number, Whole
 from app.markers.magnet import InformationTag, Polarity, check_magnet_count, segments_in
 from app.markers.magnet_design import Meaning
+from app.markers.reading import Matrix
 from app.sensors.magnetometer_bar import MagnetometerBar
 
 # === What matching and localization need to know of a registered information tag.
@@ -299,20 +300,27 @@ DISTINCT_RATIO, DISTINCT_M2 = 4.0, 1e-4
 
 
 @dataclass(frozen=True, slots=True)
+class TagFixSigma:
+    """Standard deviations of a vehicle's position at a tag, along and across the lane."""
+
+    along_m: float
+    across_m: float
+    heading_deg: float
+
+
+@dataclass(frozen=True, slots=True)
 class TagFix:
-    """Where the vehicle was when the bar passed a tag's last magnet."""
+    """The vehicle's position at a tag's last magnet; the covariance is of east, north [m] and heading [rad]."""
 
     t_s: float  # [s] time in the trace
     # `lon_deg`, `lat_deg`, `heading_deg`: [deg] of the vehicle's reference point
     lon_deg: float
     lat_deg: float
     heading_deg: float
-    covariance: Floats  # shape (3, 3): east, north, heading. [m, m, rad]
-    # `along_std_m`, `across_std_m`: [m] along and across the lane
-    along_std_m: float
-    across_std_m: float
+    covariance: Matrix  # shape (3, 3)
+    sigma: TagFixSigma
     across_m: float  # [m] of the bar's middle from the tag's line, left positive
-    grade: LocalizationGrade
+    localization_grade: LocalizationGrade
     notes: tuple[str, ...]
 
 
@@ -374,10 +382,9 @@ def fix_from_tag(reading: TagReading, tag: RegisteredTag, bar: MagnetometerBar) 
         lat_deg=lat_deg,
         heading_deg=math.degrees(passage.heading_rad) % 360.0,
         covariance=covariance,
-        along_std_m=along_std_m,
-        across_std_m=across_std_m,
+        sigma=TagFixSigma(along_std_m, across_std_m, math.degrees(heading_std)),
         across_m=float((middles_m.mean(axis=0) - passage.holes_m[-1]) @ lane_left),
-        grade=LocalizationGrade.UNFIT if tag.localization_warnings else LocalizationGrade(tag.grade),
+        localization_grade=LocalizationGrade.UNFIT if tag.localization_warnings else LocalizationGrade(tag.grade),
         notes=tag.localization_warnings,
     )
 
@@ -411,7 +418,8 @@ def _standard_errors(reading: TagReading, tag: RegisteredTag, passage: _Passage)
     lateral_std_m = LATERAL_STD_M * max(clearance_m / LATERAL_STD_CLEARANCE_M, MIN_CLEARANCE_RATIO) ** 2
     spread_m = math.sqrt(float(((along_m - along_m.mean()) ** 2).sum()))
     heading_std = math.hypot(lateral_std_m / spread_m, math.radians(TAG_BEARING_STD_DEG))
-    along_std_m = math.hypot(float(np.mean([m.along_std_m for m in reading.magnets])), survey_m)  # they share stamps
+    stamps_m = float(np.mean([m.along_std_m or 0.0 for m in reading.magnets]))  # they share stamps
+    along_std_m = math.hypot(stamps_m, survey_m)
     turned_m = 0.5 * abs(along_m[-1] - along_m[0]) * heading_std
     return along_std_m, math.hypot(lateral_std_m / math.sqrt(count), survey_m, turned_m), heading_std
 

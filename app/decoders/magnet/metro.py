@@ -239,7 +239,7 @@ def _lines(magnets: list[MagnetReading]) -> list[LineCrossing]:
             m.lateral_cm, m.confidence,
         )
         for m in magnets
-        if m.orientation is Orientation.UP
+        if m.phi_deg is Orientation.UP
     ]  # fmt: skip
 
 
@@ -249,7 +249,7 @@ def _tags(
     """Every so many forward magnets make a tag, from the first on."""
     out = []
     row: list[MagnetReading] = []
-    for magnet in (m for m in magnets if m.orientation is Orientation.FORWARD):
+    for magnet in (m for m in magnets if m.phi_deg is Orientation.FORWARD):
         if row and magnet.odometer_m - row[-1].odometer_m > settings.tag_gap_m:
             row = []
         row.append(magnet)

@@ -40,19 +40,14 @@ class MagnetReading:
     odometer_m: float  # [m] distance driven since the trace began, by the vehicle's speed
     lateral_cm: float  # [cm] on the bar, from its middle, left positive
     polarity: Polarity  # as driven over: of a forward magnet (phi = 0) the other one if the vehicle is on the wrong way
-    orientation: Orientation
+    phi_deg: Orientation
     confidence: float  # probability that polarity and orientation are right, 0 to 1
     clearance_cm: float = 0.0  # [cm] of the bar above the magnet
     moment_am2: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [A m2] fitted moment in vehicle axes
-    along_std_m: float = 0.0  # [m] standard error of its place along the drive
+    along_std_m: float | None = None  # [m] standard error of its place along the drive; the paper's method has none
     # [m] the same against magnets near it, with which it shares the error of the time stamps
     relative_std_m: float = 0.0
     snr: float = 0.0  # root of the energy that the magnet explains, in standard deviations of the noise
-
-    @property
-    def phi_deg(self) -> int:
-        """Angle between the magnet's axis and the road, 0 or 90. [deg]"""
-        return int(self.orientation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

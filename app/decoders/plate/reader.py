@@ -409,7 +409,7 @@ def grade_plate(fit: PlateFit, units: UnitEvidence, decoded: DecodedSymbols, wea
         _grade(fit.explained, GRADES.grid),
         _grade(unused, GRADES.unused_correction),
     )
-    return PlateGrade(min(parts), *parts)
+    return PlateGrade("FDCBA"[int(min(parts))], min(parts), *parts)
 
 
 def _grade(value: float, limits: tuple[float, ...]) -> float:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
@@ -19,10 +18,8 @@ from app.families.family import (
     Match,
     Nearby,
     Pixels,
-    PoseDocument,
     distance_to_row,
     nearest_match,
-    pose_document,
     rounded,
 )
 from app.markers.plate import (
@@ -34,7 +31,7 @@ from app.markers.plate import (
     decimal_codes,
     resolve_position,
 )
-from app.markers.reading import PlateReading
+from app.markers.reading import PlateGrade, PlatePose, PlateReading
 from app.registry import markers as store
 from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter
@@ -70,19 +67,6 @@ class PlateSearch:
     codebook: tuple[PlateCode, ...] = ()  # plates that the registry knows nearby
     # dimensions to look for; the decoder's own where there are none
     geometries: tuple[PlateGeometry, ...] = ()  # dimensions to look for; the decoder's own where there are none
-
-
-class PlateGradeDocument(TypedDict):
-    """Print quality of a plate as the frame shows it."""
-
-    letter: str
-    overall: float
-    contrast: float
-    modulation: float
-    fixed_pattern: float
-    axial_nonuniformity: float
-    grid_nonuniformity: float
-    unused_correction: float
 
 
 class ReadGeometryDocument(TypedDict):
@@ -132,8 +116,8 @@ class PlateReadingDocument(TypedDict):
     height_px: float
     width_px: float
     geometry: ReadGeometryDocument | None
-    grade: PlateGradeDocument | None
-    pose: PoseDocument | None
+    grade: PlateGrade | None
+    pose: PlatePose | None
 
 
 def decode_plates(pixels: Pixels, **options: Any) -> list[PlateReading]:
@@ -198,7 +182,35 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
 
     def document(self, reading: PlateReading) -> PlateReadingDocument:
         """A reading as clients see it."""
-        return _reading_document(reading)
+        code, likely, geometry = reading.code, reading.likely_code, reading.geometry
+        shown, covariance, checked = code or likely, reading.corners_covariance_px2, PlateScheme.POSITION_CHECK
+        return {
+            "family": "plate",
+            "outcome": str(reading.outcome),
+            "reason": reading.reason or None,
+            "certainty": reading.certainty,
+            "digits": reading.digits,
+            "likely_digits": likely.digits if likely else None,
+            "doubtful_cells": [int(cell) for cell in reading.doubtful_cells],
+            "scheme": shown.scheme if shown else None,
+            "possible_schemes": [
+                {"scheme": one.scheme, "check_digits": one.check_digits if one.scheme is checked else None}
+                for one in (_possible_codes(shown) if shown else ())
+            ],
+            "registry_number": code.registry_number if code and code.scheme is PlateScheme.ID else None,
+            "confidence": float(reading.confidence),
+            "cell_confidence": [round(float(value), 6) for value in reading.cell_confidence],
+            "corrected_cells": [int(cell) for cell in reading.corrected_cells],
+            "from_codebook": bool(reading.from_codebook),
+            "evidence_frames": list(reading.frames),
+            "corners_px": rounded(reading.corners_px, 3),
+            "corner_sigma_px": None if covariance is None else float(np.sqrt(np.trace(covariance) / len(covariance))),
+            "height_px": round(float(reading.height_px), 2),
+            "width_px": round(float(reading.width_px), 2),
+            "geometry": {"n": geometry.n, "unit_mm": geometry.unit_mm, "gap_mm": geometry.gap_mm} if geometry else None,
+            "grade": reading.grade,
+            "pose": reading.pose,
+        }
 
     def observation(self, reading: PlateReading) -> dict[str, Any]:
         """Confidence, grade and corrections."""
@@ -278,53 +290,3 @@ def _match_at(code: PlateCode, resolved: ResolvedPosition, position: Approximate
     else:
         note = "not registered; the position is what its digits say"
     return Match(None, resolved.lon_deg, resolved.lat_deg, away_m, plausible, (), note, fits_two)
-
-
-def _reading_document(reading: PlateReading) -> PlateReadingDocument:
-    code, likely, geometry, grade = reading.code, reading.likely_code, reading.geometry, reading.grade
-    shown = code or likely
-    return {
-        "family": "plate",
-        "outcome": str(reading.outcome),
-        "reason": reading.reason or None,
-        "certainty": str(reading.certainty) if reading.certainty else None,
-        "digits": reading.digits,
-        "likely_digits": likely.digits if likely else None,
-        "doubtful_cells": [int(cell) for cell in reading.doubtful_cells],
-        "scheme": str(shown.scheme) if shown else None,
-        "possible_schemes": [
-            {
-                "scheme": str(one.scheme),
-                "check_digits": one.check_digits if one.scheme is PlateScheme.POSITION_CHECK else None,
-            }
-            for one in (_possible_codes(shown) if shown else ())
-        ],
-        "registry_number": code.registry_number if code and code.scheme is PlateScheme.ID else None,
-        "confidence": float(reading.confidence),
-        "cell_confidence": [round(float(value), 6) for value in reading.cell_confidence],
-        "corrected_cells": [int(cell) for cell in reading.corrected_cells],
-        "from_codebook": bool(reading.from_codebook),
-        "evidence_frames": list(reading.frames),
-        "corners_px": rounded(reading.corners_px, 3),
-        "corner_sigma_px": _corner_sigma_px(reading.corners_covariance_px2),
-        "height_px": round(float(reading.height_px), 2),
-        "width_px": round(float(reading.width_px), 2),
-        "geometry": {"n": geometry.n, "unit_mm": geometry.unit_mm, "gap_mm": geometry.gap_mm} if geometry else None,
-        "grade": {
-            "letter": grade.letter,
-            "overall": float(grade.overall),
-            "contrast": float(grade.contrast),
-            "modulation": float(grade.modulation),
-            "fixed_pattern": float(grade.fixed_pattern),
-            "axial_nonuniformity": float(grade.axial_nonuniformity),
-            "grid_nonuniformity": float(grade.grid_nonuniformity),
-            "unused_correction": float(grade.unused_correction),
-        }
-        if grade
-        else None,
-        "pose": pose_document(reading.pose),
-    }
-
-
-def _corner_sigma_px(covariance: npt.NDArray[np.float64] | None) -> float | None:
-    return None if covariance is None else float(np.sqrt(np.trace(covariance) / len(covariance)))

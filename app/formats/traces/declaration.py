@@ -180,7 +180,7 @@ MAX_LISTED = 200
 
 @dataclass(frozen=True, slots=True)
 class TraceGap:
-    """A stretch without usable samples."""
+    """A stretch without usable samples: `lost_s` after `t_s`, before the sample with this index."""
 
     part: str  # file that it comes from
     sample: int  # index in the trace of the first sample after it
@@ -190,7 +190,7 @@ class TraceGap:
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut:
+class LeftOutRows:
     """Values or rows of a file that are not in the trace."""
 
     part: str  # file that it comes from
@@ -201,21 +201,25 @@ class LeftOut:
 
 @dataclass(slots=True)
 class TraceReport:
-    """About reading a trace."""
+    """About reading the files of a recording."""
 
     formats: dict[str, TraceFormat] = field(default_factory=dict)  # detected or declared format of each file
     samples: int = 0
     rate_hz: float = 0.0  # [Hz] median
     duration_s: float = 0.0  # [s] from the first sample to the last
+    driven_m: float = 0.0  # [m] by the vehicle's speed
     gaps: list[TraceGap] = field(default_factory=list)  # the first ones
     gap_count: int = 0
-    left_out: list[LeftOut] = field(default_factory=list)
+    left_out: list[LeftOutRows] = field(default_factory=list)
     # [s] added to the times of a file to get the trace's
     clock_offsets_s: dict[str, float] = field(default_factory=dict)
     # `speed_coverage`, `heading_coverage`: share of the trace with a value within a second, 0 to 1
     speed_coverage: float = 0.0
     heading_coverage: float = 0.0
     warnings: list[str] = field(default_factory=list)
+    # `load_ms`, `decode_ms`: [ms] spent on reading the files, and on the magnets
+    load_ms: float = 0.0
+    decode_ms: float = 0.0
 
     def add_gap(self, gap: TraceGap) -> None:
         """Count a gap, and list it if there is room."""
@@ -229,9 +233,9 @@ class TraceReport:
             return
         for i, known in enumerate(self.left_out):
             if (known.part, known.what) == (part, what):
-                self.left_out[i] = LeftOut(part, what, known.count + count, known.reason)
+                self.left_out[i] = LeftOutRows(part, what, known.count + count, known.reason)
                 return
-        self.left_out.append(LeftOut(part, what, count, reason))
+        self.left_out.append(LeftOutRows(part, what, count, reason))
 
     def warn(self, text: str) -> None:
         """Add a warning for the uploader."""

@@ -29,6 +29,7 @@ from app.services.decodes.packet_documents import MAX_REFUSED
 from app.services.decodes.packet_tasks import read_drive
 from app.services.decodes.trace_tasks import DEFAULT_SERIES, MAX_POINTS, MAX_SERIES, SamplesDocument, read_samples
 from app.services.decodes.upload_path import Upload, UploadHandler, UploadPath
+from app.services.documents import listed
 from app.services.fleet.vehicles import resolve_context
 from app.services.idempotency import IdempotencyKey, find_response
 from app.services.jobs import RunningJob
@@ -143,7 +144,7 @@ class Decodes:
             context = DecodeContext.model_validate(row.context)
             upload = Upload(agency_id, Author(""), file, context, row.created_at, wait_s=_WAIT_S, again_id=decode_id)
             decoded, plot = self._path.decode_again(upload, handler)
-        return dict(decoded.document), plot
+        return decoded.result, plot
 
     # --- stored decodes -----------------------------------------------------------------------------------------------
 
@@ -333,9 +334,9 @@ def _packets(packets: Sequence[ReceivedPacket], track: PoseTrack | None, result:
         order[np.linspace(0, len(order) - 1, min(len(order), MAX_PACKETS)).round().astype(int)] if len(order) else order
     )
     chosen = [packets[k] for k in kept]
-    listed = (result.get("report") or {}).get("refused") or []
-    refused = {entry["entry"]: entry for entry in listed}
-    last = listed[-1]["entry"] if len(listed) >= MAX_REFUSED else None
+    stored = (result.get("report") or {}).get("refused") or []
+    refused = {entry["entry"]: entry for entry in stored}
+    last = stored[-1]["entry"] if len(stored) >= MAX_REFUSED else None
     positions = np.full((len(chosen), 2), np.nan)
     if track is not None:
         positions = vehicle_positions(track, times_s[kept])
@@ -343,14 +344,14 @@ def _packets(packets: Sequence[ReceivedPacket], track: PoseTrack | None, result:
     return {
         "total": len(packets),
         "entry": [packet.entry for packet in chosen],
-        "time_s": _listed(times_s[kept], 3),
+        "time_s": listed(times_s[kept], 3),
         "number": [_number(packet) for packet in chosen],
-        "rssi_dbm": _listed([packet.rssi_dbm for packet in chosen], 2),
-        "snr_db": _listed([packet.snr_db for packet in chosen], 2),
+        "rssi_dbm": listed([packet.rssi_dbm for packet in chosen], 2),
+        "snr_db": listed([packet.snr_db for packet in chosen], 2),
         "verdict": verdicts,
         "reason": [refused[packet.entry]["reason"] if packet.entry in refused else None for packet in chosen],
-        "lon_deg": _listed(positions[:, 0], 9),
-        "lat_deg": _listed(positions[:, 1], 9),
+        "lon_deg": listed(positions[:, 0], 9),
+        "lat_deg": listed(positions[:, 1], 9),
         "track": None if track is None or not len(track.time_s) else _track(track),
     }
 
@@ -367,7 +368,7 @@ def _track(track: PoseTrack) -> VehicleTrackDocument:
         "time_s": np.round(track.time_s[kept], 3).tolist(),
         "lon_deg": np.round(track.lon_deg[kept], 9).tolist(),
         "lat_deg": np.round(track.lat_deg[kept], 9).tolist(),
-        "heading_deg": _listed(track.heading_deg[kept], 2),
+        "heading_deg": listed(track.heading_deg[kept], 2),
     }
 
 
@@ -381,8 +382,3 @@ def _number(packet: ReceivedPacket) -> int | None:
         return decode_message(packet.payload)[0].number
     except WaymarkError:
         return None
-
-
-def _listed(values: object, places: int) -> list[float | None]:
-    rounded: list[float] = np.round(np.asarray(values, float), places).tolist()
-    return [value if np.isfinite(value) else None for value in rounded]

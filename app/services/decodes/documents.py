@@ -4,39 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import datetime
-from typing import Annotated, Any, NotRequired, cast
+from typing import Annotated, Any, Literal, NotRequired, cast
 
-from pydantic import Field, JsonValue
-from typing_extensions import TypedDict
+from pydantic import Discriminator, Field, JsonValue
+from typing_extensions import TypeAliasType, TypedDict
 
 from app.registry.decodes import DecodeRow
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
-from app.services.decodes.frame_documents import (
-    AnyReading,
-    FixDocument,
-    FrameDocument,
-    FrameSummary,
-    SeenPlateDocument,
-)
-from app.services.decodes.frame_poses import GapDocument, ReceiverPositions
-from app.services.decodes.lane_documents import DecodedLaneDocument, OverlayDocument, SteeringDocument
-from app.services.decodes.packet_documents import (
-    PacketReportDocument,
-    PacketSummary,
-    PathLossDocument,
-    ReceivedMarkerDocument,
-)
-from app.services.decodes.trace_documents import (
-    CrossingDocument,
-    NoiseDocument,
-    PassedMagnetDocument,
-    TagDocument,
-    TagFixDocument,
-    TraceMotionDocument,
-    TraceReportDocument,
-    TraceSummary,
-)
+from app.services.decodes.frame_documents import FramesResult
+from app.services.decodes.packet_documents import PacketsResult
+from app.services.decodes.trace_documents import TraceResult
 from app.services.documents import ErrorDocument
 
 
@@ -54,12 +32,9 @@ class DecodeLinks(TypedDict):
     overlay: NotRequired[str]
 
 
-class DecodeHead(TypedDict):
-    """A decode without its result."""
-
+class _Decode(TypedDict):
     id: str
     state: JobState
-    kind: DecodeKind
     progress: Annotated[float, Field(description="0 to 1.")]
     attempts: int
     created_at: datetime
@@ -71,33 +46,35 @@ class DecodeHead(TypedDict):
     links: DecodeLinks
 
 
-class DecodeDocument(DecodeHead):
-    """A decode. `decoder` and what follows it are there once it is done, or as far as it is done: then `partial`."""
+class DecodeHead(_Decode):
+    """A decode without its result."""
 
+    kind: DecodeKind
+
+
+class FramesDecode(_Decode, FramesResult):
+    """A decode of frames. `decoder` and what follows it are there once it is done, or as far as it is: `partial`."""
+
+    kind: Literal[DecodeKind.FRAME, DecodeKind.ARCHIVE, DecodeKind.VIDEO]
     partial: NotRequired[Annotated[bool, Field(description="The decode goes on; this is its result so far.")]]
 
-    decoder: NotRequired[str]
-    summary: NotRequired[FrameSummary | TraceSummary | PacketSummary]
-    codebook_plates: NotRequired[int]
-    readings: NotRequired[list[AnyReading]]
-    frames: NotRequired[list[FrameDocument]]
-    plates: NotRequired[list[SeenPlateDocument]]
-    gaps: NotRequired[list[GapDocument]]
-    receiver: NotRequired[ReceiverPositions | None]
-    warnings: NotRequired[list[str]]
-    fix: NotRequired[FixDocument | TagFixDocument | None]
-    codebook_tags: NotRequired[int]
-    report: NotRequired[TraceReportDocument | PacketReportDocument]
-    tags: NotRequired[list[TagDocument]]
-    crossings: NotRequired[list[CrossingDocument]]
-    magnets: NotRequired[list[PassedMagnetDocument]]
-    noise: NotRequired[list[NoiseDocument]]
-    motion: NotRequired[TraceMotionDocument]
-    markers: NotRequired[list[ReceivedMarkerDocument]]
-    lane: NotRequired[DecodedLaneDocument]
-    steering: NotRequired[SteeringDocument | None]
-    overlay: NotRequired[OverlayDocument | None]
-    path_loss: NotRequired[PathLossDocument | None]
+
+class TraceDecode(_Decode, TraceResult):
+    """A decode of a magnetometer trace. `decoder` and what follows it are there once it is done."""
+
+    kind: Literal[DecodeKind.TRACE]
+
+
+class PacketsDecode(_Decode, PacketsResult):
+    """A decode of a packet log. `decoder` and what follows it are there once it is done."""
+
+    kind: Literal[DecodeKind.PACKETS]
+
+
+DecodeDocument = TypeAliasType(
+    "DecodeDocument", Annotated[FramesDecode | TraceDecode | PacketsDecode, Discriminator("kind")]
+)
+"""A decode with its result; `kind` tells which."""
 
 
 class DecodePage(TypedDict):

@@ -191,7 +191,7 @@ class FrameSummary(TypedDict):
     outcomes: dict[str, int]
 
 
-class FramesResult(TypedDict):
+class FramesResult(TypedDict, total=False):
     """The result of decoding frames."""
 
     decoder: str

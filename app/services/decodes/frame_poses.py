@@ -23,6 +23,7 @@ from app.registry.decodes import DecodeRow
 from app.sensors.pose_track import PoseTrack
 from app.services.decodes.context import DecodeKind, DecodeTimes, clock_of, stamp
 from app.services.decodes.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
+from app.services.documents import listed
 from app.tracks.files import gpx_document
 
 # === Positions of the vehicle's own receiver, as a decode keeps them for the track of its drive.
@@ -53,12 +54,11 @@ def receiver_positions(track: PoseTrack | None) -> ReceiverPositions | None:
         return None
     every_s = max(EVERY_S, float(track.time_s[-1] - track.time_s[0]) / MAX_POSITIONS)
     kept = np.unique(np.floor((track.time_s - track.time_s[0]) / every_s), return_index=True)[1]
-    accuracy_m = np.round(track.accuracy_m[kept], 3).tolist()
     return {
         "time_s": np.round(track.time_s[kept], 3).tolist(),
         "lon_deg": np.round(track.lon_deg[kept], 9).tolist(),
         "lat_deg": np.round(track.lat_deg[kept], 9).tolist(),
-        "accuracy_m": [value if value == value else None for value in accuracy_m],  # NaN is not itself
+        "accuracy_m": listed(track.accuracy_m[kept], 3),
     }
 
 

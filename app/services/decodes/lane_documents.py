@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypedDict
 
-from app.lanes.overlay import LaneOverlay, LineInFrame, PointsInFrame
 from app.lanes.smooth_line import wgs84_from_plane
 from app.lanes.types import Lane, TrackAgreement
+from app.services.documents import document_of, listed
 
 if TYPE_CHECKING:  # it loads numba
     from app.simulation.steering import SteeringCheck
@@ -51,20 +50,6 @@ class LaneStations(TypedDict):
     confidence: list[float | None]
 
 
-class TrackAgreementDocument(TypedDict):
-    """How the path lies against the vehicle's track, beyond what driver and receiver explain where it disagrees."""
-
-    east_m: float
-    north_m: float
-    shift_sigma_m: float
-    turn_deg: float
-    turn_sigma_deg: float
-    scale_ppm: float
-    scale_sigma_ppm: float
-    significance: float
-    disagrees: bool
-
-
 class DecodedLaneDocument(TypedDict):
     """The lane's reference path, at stations along it."""
 
@@ -77,7 +62,7 @@ class DecodedLaneDocument(TypedDict):
     sigma_max_m: float | None
     min_radius_m: float | None
     speed_limits_kmh: list[float]
-    track_agreement: TrackAgreementDocument | None
+    track_agreement: TrackAgreement | None
     origin: Origin
     stations: LaneStations
     left: list[list[list[float]]]
@@ -96,17 +81,6 @@ class SteeringDocument(TypedDict):
     mean_speed_m_s: float | None
     lateral_acceleration_m_s2: float | None
     distance_m: float | None
-
-
-class OverlayDocument(TypedDict):
-    """Pixel coordinates of the lane in the camera frame."""
-
-    frame: str
-    left_px: list[list[list[float]]]
-    right_px: list[list[list[float]]]
-    centre_px: list[list[list[float]]]
-    area_px: list[list[list[float]]]
-    markers_px: list[list[float]]
 
 
 class LaneGeometry(TypedDict):
@@ -153,41 +127,25 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
         "sigma_max_m": round(float(lane.sigma_m.max()), 4) if has_sigma else None,
         "min_radius_m": round(1 / sharpest, 1) if sharpest > _STRAIGHT_PER_M else None,
         "speed_limits_kmh": _distinct(lane.speed_limit_kmh),
-        "track_agreement": _track_agreement(lane.track_agreement),
+        "track_agreement": lane.track_agreement,
         "origin": {"lon_deg": origin[0], "lat_deg": origin[1]},
         "stations": {
-            "station_m": _column(lane.station_m, 3),
-            "lon_deg": _column(lane.lon_deg, 9),
-            "lat_deg": _column(lane.lat_deg, 9),
-            "north_m": _column(lane.north_m, 4),
-            "east_m": _column(lane.east_m, 4),
-            "down_m": _column(lane.down_m, 4),
-            "heading_deg": _column(lane.heading_deg, 4),
-            "curvature_per_m": _column(lane.curvature_per_m, 6),
-            "width_m": _column(lane.width_m, 3),
-            "speed_limit_kmh": _column(lane.speed_limit_kmh, 3),
-            "preview_m": _column(lane.station_m[-1] - lane.station_m if known else lane.station_m, 3),
-            "sigma_m": _column(lane.sigma_m, 4),
-            "confidence": _column(lane.confidence, 5),
+            "station_m": listed(lane.station_m, 3),
+            "lon_deg": listed(lane.lon_deg, 9),
+            "lat_deg": listed(lane.lat_deg, 9),
+            "north_m": listed(lane.north_m, 4),
+            "east_m": listed(lane.east_m, 4),
+            "down_m": listed(lane.down_m, 4),
+            "heading_deg": listed(lane.heading_deg, 4),
+            "curvature_per_m": listed(lane.curvature_per_m, 6),
+            "width_m": listed(lane.width_m, 3),
+            "speed_limit_kmh": listed(lane.speed_limit_kmh, 3),
+            "preview_m": listed(lane.station_m[-1] - lane.station_m if known else lane.station_m, 3),
+            "sigma_m": listed(lane.sigma_m, 4),
+            "confidence": listed(lane.confidence, 5),
         },
         "left": _pieces(lane.left_enu_m, origin),
         "right": _pieces(lane.right_enu_m, origin),
-    }
-
-
-def _track_agreement(found: TrackAgreement | None) -> TrackAgreementDocument | None:
-    if found is None:
-        return None
-    return {
-        "east_m": round(found.east_m, 3),
-        "north_m": round(found.north_m, 3),
-        "shift_sigma_m": round(found.shift_sigma_m, 3),
-        "turn_deg": round(found.turn_deg, 4),
-        "turn_sigma_deg": round(found.turn_sigma_deg, 4),
-        "scale_ppm": round(found.scale_ppm, 1),
-        "scale_sigma_ppm": round(found.scale_sigma_ppm, 1),
-        "significance": round(found.significance, 1),
-        "disagrees": found.disagrees,
     }
 
 
@@ -215,48 +173,8 @@ def steering_document(check: SteeringCheck | str | None) -> SteeringDocument | N
     if check is None:
         return None
     if isinstance(check, str):
-        return {
-            "refusal": check, "controller": None, "completed": None, "rms_m": None, "max_m": None, "mse_m2": None,
-            "mean_speed_m_s": None, "lateral_acceleration_m_s2": None, "distance_m": None,
-        }  # fmt: skip
-    return {
-        "refusal": None,
-        "controller": str(check.controller),
-        "completed": check.completed,
-        "rms_m": round(float(check.rms_m), 6),
-        "max_m": round(float(check.max_m), 6),
-        "mse_m2": round(float(check.mse_m2), 6),
-        "mean_speed_m_s": round(float(check.mean_speed_m_s), 6),
-        "lateral_acceleration_m_s2": round(float(check.lateral_acceleration_m_s2), 6),
-        "distance_m": round(float(check.distance_m), 6),
-    }
-
-
-def overlay_document(overlay: LaneOverlay, frame: str) -> OverlayDocument:
-    """Pixel coordinates of a lane in a frame."""
-    return {
-        "frame": frame,
-        "left_px": _line_px(overlay.left),
-        "right_px": _line_px(overlay.right),
-        "centre_px": _line_px(overlay.centre),
-        "area_px": [_points_px(polygon) for polygon in overlay.area_px],
-        "markers_px": _points_px(overlay.markers.points_px[overlay.markers.visible]),
-    }
-
-
-def overlay_from_document(document: OverlayDocument) -> LaneOverlay:
-    """A stored overlay, to be drawn again."""
-
-    def line(pieces: list[list[list[float]]]) -> LineInFrame:
-        return LineInFrame(_NO_POINTS, tuple(np.array(piece, float).reshape(-1, 2) for piece in pieces))
-
-    markers = np.array(document["markers_px"], float).reshape(-1, 2)
-    shown = PointsInFrame(markers, np.ones(len(markers), bool), np.full(len(markers), np.nan))
-    area = tuple(np.array(polygon, float).reshape(-1, 2) for polygon in document["area_px"])
-    return LaneOverlay(line(document["left_px"]), line(document["right_px"]), line(document["centre_px"]), area, shown)
-
-
-_NO_POINTS = PointsInFrame(np.empty((0, 2)), np.empty(0, bool), np.empty(0))
+        return cast("SteeringDocument", dict.fromkeys(SteeringDocument.__annotations__) | {"refusal": check})
+    return document_of(SteeringDocument, check, refusal=None)
 
 
 def _feature(kind: str, geometry: GeometryType, coordinates: Any, properties: dict[str, object]) -> LaneFeature:
@@ -265,20 +183,6 @@ def _feature(kind: str, geometry: GeometryType, coordinates: Any, properties: di
         "geometry": {"type": geometry, "coordinates": coordinates},
         "properties": {"kind": kind, **properties},
     }
-
-
-def _line_px(line: LineInFrame) -> list[list[list[float]]]:
-    return [_points_px(piece) for piece in line.pieces_px]
-
-
-def _points_px(points: Floats) -> list[list[float]]:
-    rounded: list[list[float]] = np.round(points, 2).tolist()
-    return rounded
-
-
-def _column(values: Floats, places: int) -> list[float | None]:
-    rounded = np.round(values, places) + 0.0  # no negative zero
-    return [value if math.isfinite(value) else None for value in rounded.tolist()]
 
 
 def _distinct(values: Floats) -> list[float]:

@@ -21,7 +21,7 @@ from app.services.decodes.context import DecodeKind, DecodeRules, DecodeTimes, c
 from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.frame_poses import TrackGeometry
 from app.services.decodes.frame_tasks import FramePicture, annotate_frame
-from app.services.decodes.lane_documents import LaneCollection, lane_geojson, overlay_from_document
+from app.services.decodes.lane_documents import LaneCollection, lane_geojson
 from app.services.decodes.packet_tasks import draw_overlay
 from app.services.decodes.video_handler import video_of
 from app.services.decodes.video_tasks import draw_video_frame
@@ -240,9 +240,8 @@ class DecodeOutputs:
                 limit="a packet log with a camera frame, a camera and the vehicle's pose",
                 cure="report.warnings lists what was missing",
             )
-        shown = overlay_from_document(overlay)
         with self._upload(row) as file:
-            return self._processes.run(draw_overlay, file, overlay["frame"], shown, suffix, self._rules.images)
+            return self._processes.run(draw_overlay, file, overlay, suffix, self._rules.images)
 
     def lane(self, caller: Caller, decode_id: str) -> LaneCollection:
         """Path, boundaries and markers of a drive as GeoJSON.

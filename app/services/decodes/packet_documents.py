@@ -14,18 +14,17 @@ from app.decoders.cerpm.merge import Disagreement, vehicle_positions
 from app.decoders.cerpm.signal import SignalProfile
 from app.decoders.cerpm.verify import Verdict
 from app.geodesy import LocalizationGrade
+from app.lanes.overlay import LaneInFrame
 from app.lanes.types import Lane
 from app.markers.cerpm import LaneSide
-from app.radio.link import Estimate
+from app.radio.link import PathLoss
 from app.registry.decodes import NewObservation
 from app.services.decodes.context import count_of
 from app.services.decodes.frame_poses import ReceiverPositions, receiver_positions
 from app.services.decodes.lane_documents import (
     DecodedLaneDocument,
-    OverlayDocument,
     SteeringDocument,
     lane_document,
-    overlay_document,
     steering_document,
 )
 from app.services.decodes.matching import ReadPackets
@@ -135,25 +134,7 @@ class PacketReportDocument(TypedDict):
     decode_ms: float
 
 
-class EstimateDocument(TypedDict):
-    """An estimate with its interval of 95 %."""
-
-    value: float
-    low: float
-    high: float
-
-
-class PathLossDocument(TypedDict):
-    """The fitted path loss of the drive."""
-
-    level_at_50m_dbm: EstimateDocument
-    exponent: EstimateDocument
-    spread_db: float
-    packets: int
-    fitted_exponent: bool
-
-
-class PacketsResult(TypedDict):
+class PacketsResult(TypedDict, total=False):
     """The result of decoding a packet log."""
 
     decoder: str
@@ -162,8 +143,8 @@ class PacketsResult(TypedDict):
     markers: list[ReceivedMarkerDocument]
     lane: DecodedLaneDocument
     steering: SteeringDocument | None
-    overlay: OverlayDocument | None
-    path_loss: PathLossDocument | None
+    overlay: LaneInFrame | None
+    path_loss: PathLoss | None
     receiver: ReceiverPositions | None
 
 
@@ -176,7 +157,6 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     document = lane_document(lane, grade=str(grade))
     document["localization_warnings"] += unsure
     document["localization_warnings"] += read.localization_warnings
-    path_loss = read.signal.path_loss
     return {
         "decoder": f"waymark {__version__} {DECODER_VERSION}",
         "summary": _summary(files, read, markers, lane),
@@ -184,16 +164,8 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
         "markers": markers,
         "lane": document,
         "steering": steering_document(result.steering),
-        "overlay": overlay_document(result.overlay, files.frame[0]) if result.overlay and files.frame else None,
-        "path_loss": None
-        if path_loss is None
-        else {
-            "level_at_50m_dbm": _estimate(path_loss.level_dbm),
-            "exponent": _estimate(path_loss.exponent),
-            "spread_db": round(path_loss.spread_db, 2),
-            "packets": path_loss.packets,
-            "fitted_exponent": path_loss.fitted_exponent,
-        },
+        "overlay": result.overlay.visible(files.frame[0]) if result.overlay and files.frame else None,
+        "path_loss": read.signal.path_loss,
         "receiver": receiver_positions(files.track),
     }
 
@@ -406,7 +378,3 @@ def _rssi_profile(profile: SignalProfile) -> RssiProfile | None:
         "distance_m": profile.distance_m[rows].round(2).tolist(),
         "rssi_dbm": profile.rssi_dbm[rows].round(2).tolist(),
     }
-
-
-def _estimate(value: Estimate) -> EstimateDocument:
-    return {"value": round(value.value, 3), "low": round(value.low, 3), "high": round(value.high, 3)}

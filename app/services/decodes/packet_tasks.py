@@ -18,7 +18,7 @@ from app.formats.packets.rows import PacketLimits
 from app.formats.poses import read_poses
 from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.parts import open_parts
-from app.lanes.overlay import LaneOverlay, VehiclePose, lane_in_frame, ned_from_enu
+from app.lanes.overlay import LaneInFrame, LaneOverlay, VehiclePose, lane_in_frame, ned_from_enu
 from app.lanes.smooth_line import plane_from_wgs84
 from app.lanes.types import Lane, LaneMarkers, LaneRules
 from app.plots.annotated_frame import draw_lane, encode_picture
@@ -205,9 +205,9 @@ def _plot(
 
 
 @decoder_task("frame", "send the frame at the camera's resolution", is_long=False)
-def draw_overlay(file: SpooledFile, frame: str, overlay: LaneOverlay, suffix: str, images: ImageLimits) -> bytes:
-    """Draw a lane over the camera frame of this name in an upload, and encode it as ``png`` or ``jpg``."""
+def draw_overlay(file: SpooledFile, lane: LaneInFrame, suffix: str, images: ImageLimits) -> bytes:
+    """Draw a lane over its camera frame in an upload, and encode it as ``png`` or ``jpg``."""
     with file.open() as stream:
-        parts = open_parts({frame: stream}, TraceLimits())
-        data = next(part.content() for part in parts if part.name == frame)
-    return encode_picture(draw_lane(load_image(data, images).pixels, overlay), suffix)
+        parts = open_parts({lane["frame"]: stream}, TraceLimits())
+        data = next(part.content() for part in parts if part.name == lane["frame"])
+    return encode_picture(draw_lane(load_image(data, images).pixels, lane), suffix)

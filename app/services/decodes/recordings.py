@@ -43,8 +43,8 @@ from app.services.decodes.packet_tasks import (
     estimate_lane,
     read_drive,
 )
-from app.services.decodes.trace_documents import trace_document
-from app.services.decodes.trace_tasks import TraceResult, decode_recording
+from app.services.decodes.trace_documents import trace_result
+from app.services.decodes.trace_tasks import DecodedTrace, decode_recording
 from app.services.decodes.upload_path import Decoded, OutdatedMatch, PendingSignal, Upload, UploadHandler
 from app.services.health.record import EVIDENCE
 from app.services.health.traces import (
@@ -120,7 +120,7 @@ class TraceSignal:
     """What a decoder process found in a recording, and the tags that it was looking for."""
 
     nearby: NearbyTags
-    result: TraceResult
+    result: DecodedTrace
 
 
 class TraceHandler(UploadHandler[TraceSignal]):
@@ -167,7 +167,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
         """Match the findings against the registered tags."""
         bar = (upload.context.trace or DeclaredTrace()).sensors
         trace = match_tags(signal.result.findings, signal.nearby.tags, bar)
-        document = trace_document(signal.result, trace, codebook_tags=len(signal.nearby.texts))
+        document = trace_result(signal.result, trace, codebook_tags=len(signal.nearby.texts))
         nearby, at = signal.nearby, upload.observed_at
         missed = missed_tags(trace, nearby.tags, nearby.complete, bar, at)
         return Decoded(document, [*_observations(trace, at), *missed])

@@ -24,6 +24,7 @@ from app.plots.trace import largest_change, plot_trace
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 from app.services.decoder_tasks import decoder_task
 from app.services.decodes.declarations import DeclaredTrace
+from app.services.documents import listed
 
 Floats = npt.NDArray[np.float64]
 _RECORDING = ("recording", "cut the recording into shorter ones")
@@ -37,25 +38,22 @@ _MOTION_VALUES = 36_000  # at most; an hour, 0.5 MB of JSON
 
 @dataclass(frozen=True, slots=True)
 class TraceMotion:
-    """Speed and heading over a recording, at even times."""
+    """Speed and heading at even times from the trace's first sample on; null where the recording has none nearby."""
 
-    start_s: float  # trace time of the first value, which is that of the first sample
+    start_s: float
     step_s: float
-    speed_m_s: tuple[float, ...] = ()  # empty where the recording has none; NaN where it has none nearby
-    heading_deg: tuple[float, ...] = ()  # the same
+    speed_m_s: list[float | None]  # empty where the recording has none
+    heading_deg: list[float | None]  # the same
 
 
 @dataclass(frozen=True, slots=True)
-class TraceResult:
+class DecodedTrace:
     """What a decoder process found in a recording."""
 
     findings: tuple[Finding, ...]  # in the order of their completion
     report: TraceReport  # about reading the files
-    length_m: float  # driven, by the vehicle's speed
     version: str  # of the decoder
     plot: bytes  # SVG
-    load_ms: float  # spent on reading the files
-    decode_ms: float  # spent on the magnets
     motion: TraceMotion
 
 
@@ -67,7 +65,7 @@ def decode_recording(
     tags: tuple[str, ...] = (),
     formats: tuple[TagFormat, ...] = (),
     limits: TraceLimits = TraceLimits(),
-) -> TraceResult:
+) -> DecodedTrace:
     """Read the files of a recording and decode their trace.
 
     Parameters
@@ -87,22 +85,16 @@ def decode_recording(
     with file.open() as stream:
         content = read_trace({name: stream}, declared, limits)
     loaded = time.perf_counter()
-    trace = content.trace
+    trace, report = content.trace, content.report
     findings, version = _decode(trace, declared, tags, formats)
     if declared.method == "matched":
         for mistake in find_mistakes(trace, declared.sensors, findings):
-            content.report.warn(mistake.text)
-    decoded = time.perf_counter()
-    return TraceResult(
-        tuple(findings),
-        content.report,
-        _driven_m(trace),
-        version,
-        plot_trace(trace, declared.sensors, findings).encode(),
-        1e3 * (loaded - began),
-        1e3 * (decoded - loaded),
-        _motion(trace),
-    )
+            report.warn(mistake.text)
+    report.load_ms, report.decode_ms = 1e3 * (loaded - began), 1e3 * (time.perf_counter() - loaded)
+    speed = np.interp(trace.t_s, trace.speed_t_s, trace.speed_m_s)
+    report.driven_m = float(np.sum(np.diff(trace.t_s) * (speed[1:] + speed[:-1]) / 2))
+    plot = plot_trace(trace, declared.sensors, findings).encode()
+    return DecodedTrace(tuple(findings), report, version, plot, _motion(trace))
 
 
 def _decode(
@@ -125,30 +117,22 @@ def _motion(trace: MagnetTrace) -> TraceMotion:
     duration = float(trace.t_s[-1] - trace.t_s[0])
     step = max(_MOTION_STEP_S, duration / _MOTION_VALUES)
     at = trace.t_s[0] + step * np.arange(int(duration / step) + 1)
-    speed = _near(at, trace.speed_t_s, trace.speed_m_s)
-    heading: list[float] = []
+    speed, heading = _near(at, trace.speed_t_s, trace.speed_m_s), np.empty(0)
     if trace.heading_t_s is not None and trace.heading_deg is not None:
-        heading = _near(at, trace.heading_t_s, np.unwrap(trace.heading_deg, period=360.0))
-    return TraceMotion(float(trace.t_s[0]), step, tuple(speed), tuple(value % 360.0 for value in heading))
+        heading = _near(at, trace.heading_t_s, np.unwrap(trace.heading_deg, period=360.0)) % 360.0
+    return TraceMotion(float(trace.t_s[0]), step, listed(speed, 3), listed(heading, 2))
 
 
-def _near(at: npt.NDArray[np.float64], time_s: npt.ArrayLike, values: npt.ArrayLike) -> list[float]:
-    """Values between samples; NaN where none is near, an empty list where there are none."""
+def _near(at: Floats, time_s: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
+    """Values between samples; NaN where none is near, empty where there are none."""
     time, given = np.asarray(time_s, float), np.asarray(values, float)
     kept = np.isfinite(time) & np.isfinite(given)
     time, given = time[kept], given[kept]
     if not time.size:
-        return []
+        return np.empty(0)
     after = np.clip(np.searchsorted(time, at), 1, max(time.size - 1, 1))
     near = np.minimum(np.abs(at - time[after - 1]), np.abs(at - time[np.minimum(after, time.size - 1)])) <= NEAR_S
-    joined: list[float] = np.where(near, np.interp(at, time, given), np.nan).tolist()
-    return joined
-
-
-def _driven_m(trace: MagnetTrace) -> float:
-    """Length of the drive by the vehicle's speed. [m]"""
-    speed = np.interp(trace.t_s, trace.speed_t_s, trace.speed_m_s)
-    return float(np.sum(np.diff(trace.t_s) * (speed[1:] + speed[:-1]) / 2))
+    return np.asarray(np.where(near, np.interp(at, time, given), np.nan))
 
 
 # === Compiling, so that no upload waits for it.
@@ -252,7 +236,7 @@ def read_samples(
     values = [_series(trace, declared.sensors, name)[first:end] for name in series]
     return {
         "series": [
-            {"name": name, "values": _listed(chosen if starts is None else _extremes(chosen, starts))}
+            {"name": name, "values": listed(chosen if starts is None else _extremes(chosen, starts), 2)}
             for name, chosen in zip(series, values, strict=True)
         ],
         "t_s": np.round(t_s if starts is None else _times(t_s, starts), 5).tolist(),
@@ -289,8 +273,3 @@ def _extremes(values: Floats, starts: npt.NDArray[np.intp]) -> Floats:
     low = np.fmin.reduceat(values, starts)
     high = np.fmax.reduceat(values, starts)
     return np.column_stack([low, high]).ravel()
-
-
-def _listed(values: Floats) -> list[float | None]:
-    rounded: list[float] = np.round(values, 2).tolist()
-    return [value if value == value else None for value in rounded]  # NaN is not itself

@@ -12,8 +12,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from functools import partial
-from typing import ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
+import orjson
 import sqlalchemy as sa
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 
@@ -34,7 +35,7 @@ from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.documents import DecodeDocument, decode_document
 from app.services.decodes.frame_documents import FramesResult
 from app.services.decodes.packet_documents import PacketsResult
-from app.services.decodes.trace_documents import TraceResultDocument
+from app.services.decodes.trace_documents import TraceResult
 from app.services.fleet.vehicles import count_driven, count_upload
 from app.services.health.record import BAR, CAMERA, RADIO, ObservedDrive, record_drive
 from app.services.idempotency import IdempotencyKey, write_once
@@ -83,11 +84,17 @@ class Upload:
 class Decoded:
     """An upload that was decoded and matched, ready to be stored."""
 
-    document: FramesResult | TraceResultDocument | PacketsResult  # the result
+    document: FramesResult | TraceResult | PacketsResult  # the result
     observations: Sequence[NewObservation] = ()
     spans: Sequence[dict[str, object]] = ()  # transmissions of CERPMs that were received
     incidents: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # for the audit log: details by action
     unregistered: Sequence[NewUnregistered] = ()  # markers that were read where none is registered
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """The result as JSON values, as it is stored."""
+        stored: dict[str, Any] = orjson.loads(orjson.dumps(self.document, option=orjson.OPT_SERIALIZE_NUMPY))
+        return stored
 
 
 class OutdatedMatch(Exception):
@@ -218,13 +225,13 @@ class UploadPath:
                             return answer.response, True
                         decoded = handler.match(connection, upload, signal)
                         measure.has_read = bool(decoded.observations)
-                        now, result = self._clock(), dict(decoded.document)
+                        now, result = self._clock(), decoded.result
                         row = row._replace(state="done", progress=1.0, attempts=1, finished_at=now)
                         row = row._replace(result=result, picture_key=picture_key)
                         self._quotas.count(connection, caller, upload.file.size)
                         store.add_decode(connection, agency_id, caller.key_id, row)
                         count_upload(connection, agency_id, row.id, upload.context, received_at)
-                        _store_findings(connection, upload, row.id, decoded, now)
+                        _store_findings(connection, upload, row.id, decoded, result, now)
                         document = answer.store(decode_document(row))
                 except OutdatedMatch:
                     continue
@@ -274,11 +281,11 @@ class UploadPath:
                         measure.has_read = bool(decoded.observations)
                         if not job.finish(connection):
                             return
-                        now, result = self._clock(), decoded.document
+                        now, result = self._clock(), decoded.result
                         store.store_result(
                             connection, agency_id, decode_id, result=result, picture_key=picture_key, now=now
                         )
-                        _store_findings(connection, upload, decode_id, decoded, now)
+                        _store_findings(connection, upload, decode_id, decoded, result, now)
                 except OutdatedMatch:
                     continue
                 stage.keep()
@@ -338,7 +345,14 @@ def _outdated_each_time() -> Unavailable:
     return Unavailable("other drives past the same markers are being stored", cure="try again in a few seconds")
 
 
-def _store_findings(connection: sa.Connection, upload: Upload, decode_id: str, decoded: Decoded, now: datetime) -> None:
+def _store_findings(
+    connection: sa.Connection,
+    upload: Upload,
+    decode_id: str,
+    decoded: Decoded,
+    result: Mapping[str, Any],
+    now: datetime,
+) -> None:
     markers.add_spans(connection, upload.agency_id, decode_id, decoded.spans)
     store.add_observations(connection, upload.agency_id, decode_id, decoded.observations)
     add_unregistered(connection, upload.agency_id, decode_id, decoded.unregistered)
@@ -347,7 +361,7 @@ def _store_findings(connection: sa.Connection, upload: Upload, decode_id: str, d
     sensor = BAR if context.trace is not None else RADIO if context.packets is not None else CAMERA
     drive = ObservedDrive(decode_id, sensor, vehicle, decoded.observations, decoded.unregistered)
     record_drive(connection, upload.agency_id, drive, now)
-    count_driven(connection, upload.agency_id, decode_id, upload.context, decoded.document)
+    count_driven(connection, upload.agency_id, decode_id, upload.context, result)
     for action, detail in decoded.incidents.items():
         audit.record(connection, upload.agency_id, upload.author, action, now=now, subject=decode_id, detail=detail)
 

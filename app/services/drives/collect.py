@@ -16,7 +16,7 @@ from app.geodesy import LocalizationGrade
 from app.inputs import Declaration, Identifier, Number, Text
 from app.registry.decodes import DecodeRow
 from app.services.decodes.context import DecodeKind
-from app.tracks import Clock, LanePath, LeftOutReason, PositionFix, Samples, TrackInput
+from app.tracks import Clock, DriveMarker, LanePath, LeftOutReason, PositionFix, Samples, TrackInput
 from app.tracks.types import MAX_CLOCK_SIGMA_S
 
 SPEED_SIGMA_M_S = 0.1
@@ -49,19 +49,6 @@ class DriveDecode(Declaration):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class LeftOutMarker:
-    """A marker that gives no fix, and why."""
-
-    marker_id: str | None
-    family: str
-    decode_id: str
-    place: int
-    reason: LeftOutReason
-    detail: str
-    number: int | None = None
-
-
 @dataclass(slots=True)
 class Collected:
     """What decodes know of a drive."""
@@ -71,8 +58,8 @@ class Collected:
     speeds: list[Samples] = field(default_factory=list)
     headings: list[Samples] = field(default_factory=list)
     paths: list[LanePath] = field(default_factory=list)
-    left_out: list[LeftOutMarker] = field(default_factory=list)
-    on_lane: list[LeftOutMarker] = field(default_factory=list)
+    left_out: list[DriveMarker] = field(default_factory=list)
+    on_lane: list[DriveMarker] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     positions: list[PositionFix] = field(default_factory=list)
 
@@ -149,8 +136,8 @@ def _add_frames(found: Collected, row: DecodeRow, clock: str, where: str, use_un
         if reason is None and time_s is None:
             reason, detail, missing = LeftOutReason.NO_TIME, "the frame has no captured_at", missing + 1
         if reason is not None:
-            marker = LeftOutMarker(match.get("marker_id"), reading.get("family", ""), row.id, place, reason, detail)
-            found.left_out.append(marker)
+            family = reading.get("family", "")
+            found.left_out.append(DriveMarker(match.get("marker_id"), family, row.id, place, False, reason, detail))
             continue
         assert time_s is not None
         cov = np.array(fix["covariance"], float)
@@ -160,10 +147,10 @@ def _add_frames(found: Collected, row: DecodeRow, clock: str, where: str, use_un
                 (float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])),
                 fix["heading_deg"], math.degrees(math.sqrt(cov[3, 3])),
                 heading_cross_m_rad=(float(cov[0, 3]), float(cov[1, 3])),
-                marker_id=match["marker_id"], family=reading["family"], source=row.id, place=place,
+                marker_id=match["marker_id"], family=reading["family"], decode_id=row.id, place=place,
             )
         )  # fmt: skip
-    if missing and not any(fix.source == row.id for fix in found.fixes):
+    if missing and not any(fix.decode_id == row.id for fix in found.fixes):
         raise _no_time(row, where, "captured_at of its frames", "send the time of each frame with the upload")
 
 
@@ -195,7 +182,7 @@ def _add_trace(found: Collected, row: DecodeRow, clock: str, where: str, use_unf
             continue
         reason, detail = _refused(match, fix, use_unfit)
         if reason is not None:
-            found.left_out.append(LeftOutMarker(match.get("marker_id"), "magnet", row.id, place, reason, detail))
+            found.left_out.append(DriveMarker(match.get("marker_id"), "magnet", row.id, place, False, reason, detail))
             continue
         cov = np.array(fix["covariance"], float)
         found.fixes.append(
@@ -203,7 +190,7 @@ def _add_trace(found: Collected, row: DecodeRow, clock: str, where: str, use_unf
                 clock, zero_s + fix["t_s"], fix["lon_deg"], fix["lat_deg"],
                 (float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])),
                 fix["heading_deg"], math.degrees(math.sqrt(cov[2, 2])),
-                marker_id=match["marker_id"], family="magnet", source=row.id, place=place,
+                marker_id=match["marker_id"], family="magnet", decode_id=row.id, place=place,
             )
         )  # fmt: skip
 
@@ -222,8 +209,16 @@ def _add_packets(found: Collected, row: DecodeRow) -> None:
         found.warnings.append(f"the path of decode {row.id} is not used: {why}")
     for place, marker in enumerate(row.result.get("markers", ())):
         why = marker.get("left_out") or (None if usable else "its path is not used")
-        entry = LeftOutMarker(
-            marker.get("marker_id"), "cerpm", row.id, place, LeftOutReason.OFF_LANE, why or "", marker["number"]
+        detail = why or "the vehicle did not drive along its path"
+        entry = DriveMarker(
+            marker.get("marker_id"),
+            "cerpm",
+            row.id,
+            place,
+            False,
+            LeftOutReason.OFF_LANE,
+            detail,
+            number=marker["number"],
         )
         (found.left_out if why else found.on_lane).append(entry)
 
@@ -245,7 +240,7 @@ def _add_positions(found: Collected, row: DecodeRow, clock: Clock) -> None:
         found.positions.append(
             PositionFix(
                 own.name, time_s, lon_deg, lat_deg, (axis_m2, 0.0, axis_m2),
-                common_m2=axis_m2, family="receiver", source=row.id, place=place,
+                common_m2=axis_m2, family="receiver", decode_id=row.id, place=place,
             )
         )  # fmt: skip
     if unknown:

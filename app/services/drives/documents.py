@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from collections import Counter
+from collections.abc import Sequence
+from datetime import datetime
 from typing import Annotated, NotRequired, cast
 
 from pydantic import Field, JsonValue
 from typing_extensions import TypedDict
 
 from app.registry.jobs import JobRow, JobState
-from app.services.documents import ErrorDocument, document_of
-from app.services.drives.collect import LeftOutMarker
-from app.tracks.types import ClockOffset, FixResult, Track
+from app.services.documents import ErrorDocument, document_of, rounded
+from app.tracks.files import time_text
+from app.tracks.types import ClockOffset, ClockState, DriveMarker, ReceiverResult, Track
 
 TRACK_FILES = {
     "track.geojson": "application/geo+json",
@@ -21,6 +23,7 @@ TRACK_FILES = {
 }
 """Files of a drive with their media types."""
 _DOUBTED = 2.5  # times the stated standard deviation of a receiver, above which a warning is given
+_PLACES = {"length_m": 2, "max_sigma_m": 3, "stated_m": 3, "assumed_m": 3, "offset_s": 4, "sigma_s": 4}
 MAX_MARKERS = 2000
 """Markers in a drive's document; its GeoJSON has all."""
 
@@ -30,7 +33,7 @@ class ClockDocument(TypedDict):
 
     clock: str
     state: Annotated[
-        str,
+        ClockState,
         Field(description="`reference`, `estimated`, `not-observable` (by this drive), `declared` as exact."),
     ]
     offset_s: Annotated[float, Field(description="To be added to the sensor's times.")]
@@ -38,36 +41,6 @@ class ClockDocument(TypedDict):
     jumped: Annotated[bool, Field(description="The clock was set during the drive; this offset holds from `from` on.")]
     from_time: str | None
     to_time: str | None
-
-
-class DriveMarker(TypedDict):
-    """A marker of a drive: used, or left out and why."""
-
-    marker_id: str | None
-    number: Annotated[int | None, Field(description="Of a CERPM.")]
-    family: str
-    decode_id: str
-    place: Annotated[int, Field(description="Frame of an archive, tag of a trace, marker of a packet log.")]
-    used: bool
-    reason: str | None
-    detail: str | None
-    time: str | None
-    lon_deg: float | None
-    lat_deg: float | None
-    distance: Annotated[float | None, Field(description="Mahalanobis distance to the track by all others.")]
-    along_m: Annotated[float | None, Field(description="From that track, forward positive.")]
-    across_m: Annotated[float | None, Field(description="From that track, left positive.")]
-
-
-class DriveReceiver(TypedDict):
-    """Positions of the vehicle's own receiver, of one decode."""
-
-    decode_id: str
-    clock: str
-    used: int
-    left_out: Annotated[int, Field(description="Too far from the track by all others.")]
-    stated_m: Annotated[float, Field(description="Median of the standard deviations that the receiver states.")]
-    assumed_m: Annotated[float, Field(description="The same, enlarged to what the markers show of it.")]
 
 
 class DriveGap(TypedDict):
@@ -109,7 +82,7 @@ class DriveReport(TypedDict):
     clocks: list[ClockDocument]
     gaps: list[DriveGap]
     markers: list[DriveMarker]
-    receivers: list[DriveReceiver]
+    receivers: list[ReceiverResult]
     warnings: list[str]
 
 
@@ -172,18 +145,9 @@ def drive_head(job: JobRow) -> DriveHead:
     )  # fmt: skip
 
 
-def track_report(
-    track: Track, left_out: tuple[LeftOutMarker, ...], on_lane: tuple[LeftOutMarker, ...], warnings: tuple[str, ...]
-) -> DriveReport:
+def track_report(track: Track, markers: Sequence[DriveMarker], warnings: tuple[str, ...]) -> DriveReport:
     """What is stored of a track besides its files."""
-    markers = [_fix_marker(result) for result in track.fixes]
-    markers += [_other_marker(entry, used=False) for entry in left_out]
-    markers += [_other_marker(entry, used=track.path_points > 0) for entry in on_lane]
-    by_reason: dict[str, int] = {}
-    for marker in markers:
-        if marker["reason"] is not None:
-            by_reason[marker["reason"]] = by_reason.get(marker["reason"], 0) + 1
-    used = sum(marker["used"] for marker in markers)
+    used = sum(marker.used for marker in markers)
     sigma = sorted(track.sigma_m.tolist())
     statistics: DriveStatistics = {
         "positions": len(track.time_s),
@@ -196,7 +160,7 @@ def track_report(
         "share_in_gaps": round(float(track.in_gap.mean()), 4),
         "markers_used": used,
         "markers_left_out": len(markers) - used,
-        "left_out_by_reason": by_reason,
+        "left_out_by_reason": Counter(marker.reason.value for marker in markers if marker.reason is not None),
         "path_points": track.path_points,
         "speed_scale": round(track.speed_scale[0], 6),
         "speed_scale_sigma": round(track.speed_scale[1], 6),
@@ -208,22 +172,13 @@ def track_report(
         "statistics": statistics,
         "clocks": [_clock(clock) for clock in track.clocks],
         "gaps": [
-            {
-                "from_time": time_text(gap.from_s), "to_time": time_text(gap.to_s), "length_m": round(gap.length_m, 2),
-                "max_sigma_m": round(gap.max_sigma_m, 3), "reason": gap.reason,
-            }
+            document_of(DriveGap, rounded(gap, _PLACES), from_time=time_text(gap.from_s), to_time=time_text(gap.to_s))
             for gap in track.gaps
         ],
-        "markers": markers[:MAX_MARKERS],
-        "receivers": [
-            {
-                "decode_id": entry.source, "clock": entry.clock, "used": entry.used, "left_out": entry.left_out,
-                "stated_m": round(entry.stated_m, 3), "assumed_m": round(entry.assumed_m, 3),
-            }
-            for entry in track.receivers
-        ],
+        "markers": list(markers[:MAX_MARKERS]),
+        "receivers": [rounded(receiver, _PLACES) for receiver in track.receivers],
         "warnings": [*warnings, *track.warnings, *_clock_warnings(track), *_receiver_warnings(track)],
-    }  # fmt: skip
+    }
 
 
 def _summary(statistics: DriveStatistics, track: Track) -> str:
@@ -246,7 +201,7 @@ def _clock_warnings(track: Track) -> list[str]:
 
 def _receiver_warnings(track: Track) -> list[str]:
     return [
-        f"the positions of the receiver of decode {entry.source} are further from the markers than their standard "
+        f"the positions of the receiver of decode {entry.decode_id} are further from the markers than their standard "
         f"deviation of {entry.stated_m:.2g} m allows: {entry.assumed_m:.2g} m were assumed"
         for entry in track.receivers
         if entry.assumed_m > _DOUBTED * entry.stated_m
@@ -255,57 +210,9 @@ def _receiver_warnings(track: Track) -> list[str]:
 
 def _clock(clock: ClockOffset) -> ClockDocument:
     known = clock.from_s == clock.from_s  # not NaN: it has fixes
-    return {
-        "clock": clock.clock,
-        "state": str(clock.state),
-        "offset_s": round(clock.offset_s, 4),
-        "sigma_s": round(clock.sigma_s, 4),
-        "jumped": clock.jumped,
-        "from_time": time_text(clock.from_s) if known else None,
-        "to_time": time_text(clock.to_s) if known else None,
-    }
-
-
-def _fix_marker(result: FixResult) -> DriveMarker:
-    fix = result.fix
-    return {
-        "marker_id": fix.marker_id,
-        "number": None,
-        "family": fix.family,
-        "decode_id": fix.source,
-        "place": fix.place,
-        "used": result.used,
-        "reason": str(result.reason) if result.reason is not None else None,
-        "detail": None if result.used else f"{result.distance:.1f} standard deviations from the track by all others",
-        "time": time_text(result.time_s),
-        "lon_deg": fix.lon_deg,
-        "lat_deg": fix.lat_deg,
-        "distance": round(result.distance, 3),
-        "along_m": round(result.along_m, 3),
-        "across_m": round(result.across_m, 3),
-    }
-
-
-def _other_marker(entry: LeftOutMarker, *, used: bool) -> DriveMarker:
-    why = None if used else entry.detail or "the vehicle did not drive along its path"
-    return {
-        "marker_id": entry.marker_id,
-        "number": entry.number,
-        "family": entry.family,
-        "decode_id": entry.decode_id,
-        "place": entry.place,
-        "used": used,
-        "reason": None if used else str(entry.reason),
-        "detail": why,
-        "time": None,
-        "lon_deg": None,
-        "lat_deg": None,
-        "distance": None,
-        "along_m": None,
-        "across_m": None,
-    }
-
-
-def time_text(seconds: float) -> str:
-    """A time in UTC, to the millisecond, RFC 3339."""
-    return datetime.fromtimestamp(round(seconds, 3), UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return document_of(
+        ClockDocument,
+        rounded(clock, _PLACES),
+        from_time=time_text(clock.from_s) if known else None,
+        to_time=time_text(clock.to_s) if known else None,
+    )

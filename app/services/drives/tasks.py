@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from app.services.decoder_tasks import decoder_task
-from app.services.drives.collect import LeftOutMarker
 from app.services.drives.documents import DriveReport, track_report
-from app.tracks.types import TrackInput, TrackRules
+from app.tracks.types import DriveMarker, TrackInput, TrackRules
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,8 +23,8 @@ def write_track(
     name: str,
     drive: TrackInput,
     rules: TrackRules,
-    left_out: tuple[LeftOutMarker, ...] = (),
-    on_lane: tuple[LeftOutMarker, ...] = (),
+    left_out: tuple[DriveMarker, ...] = (),
+    on_lane: tuple[DriveMarker, ...] = (),
     warnings: tuple[str, ...] = (),
 ) -> WrittenTrack:
     """Estimate a track and write its files.
@@ -34,26 +33,17 @@ def write_track(
     """
     from app.plots.track import plot_track
     from app.tracks.estimate import estimate_track  # not loaded before: numba takes a second
-    from app.tracks.files import write_csv, write_geojson, write_gpx
+    from app.tracks.files import fix_marker, write_csv, write_geojson, write_gpx
 
     track = estimate_track(drive, rules)
-    others: list[dict[str, object]] = [
-        {
-            "marker_id": entry.marker_id,
-            "family": entry.family,
-            "decode_id": entry.decode_id,
-            "place": entry.place,
-            "used": False,
-            "reason": str(entry.reason),
-            "detail": entry.detail,
-        }
-        for entry in left_out
-    ]
+    used = track.path_points > 0
+    passed = [replace(marker, used=True, reason=None, detail=None) if used else marker for marker in on_lane]
+    markers = [*(fix_marker(result) for result in track.fixes), *left_out, *passed]
     texts = {
-        "track.geojson": write_geojson(track, name, others),
+        "track.geojson": write_geojson(track, name, markers),
         "track.csv": write_csv(track),
         "track.gpx": write_gpx(track, name),
         "plot.svg": plot_track(track, name),
     }
-    report = track_report(track, left_out, on_lane, warnings)
+    report = track_report(track, markers, warnings)
     return WrittenTrack(report, {name: zlib.compress(text.encode()) for name, text in texts.items()})

@@ -405,7 +405,8 @@ def _along_offsets(tags: Sequence[ReadTag]) -> list[tuple[float, float] | None]:
         beside = sorted((j for j in range(len(tags)) if j != k), key=lambda j: abs(j - k))[:4]
         apart = [(odometer[k] - odometer[j]) / scale - (registered[k] - registered[j]) for j in beside]
         gap_m = float(np.median([abs(registered[k] - registered[j]) for j in beside]))
-        offsets.append((float(np.median(apart)), ODOMETER_SHARE * gap_m + tags[k].reading.magnets[0].along_std_m))
+        along_std_m = tags[k].reading.magnets[0].along_std_m or 0.0
+        offsets.append((float(np.median(apart)), ODOMETER_SHARE * gap_m + along_std_m))
     return offsets
 
 

@@ -3089,9 +3089,11 @@ export interface components {
             jumped: boolean;
             offset_s: number;
             sigma_s: number;
-            state: string;
+            state: components["schemas"]["ClockState"];
             to_time: string | null;
         };
+        /** @enum {string} */
+        ClockState: "reference" | "estimated" | "not-observable" | "declared" | "no-clock";
         CoarsePosition: {
             accuracy_m: number;
             lat_deg: number;
@@ -3158,10 +3160,6 @@ export interface components {
              * @enum {string}
              */
             scheme?: "id" | "position-robust" | "position-check" | "position";
-        };
-        CodeMeaningDocument: {
-            kind: string;
-            value: number | string;
         };
         CollectionDocument: {
             crs: string[];
@@ -3256,14 +3254,6 @@ export interface components {
         Coverage: {
             cells: number[][];
             share: number;
-        };
-        CrossingDocument: {
-            confidence: number;
-            lateral_cm: number;
-            odometer_m: number;
-            side: string;
-            style: string;
-            t_s: number;
         };
         DamageReport: {
             /** Format: date-time */
@@ -3474,49 +3464,9 @@ export interface components {
             sigma_median_m: number | null;
             speed_limits_kmh: number[];
             stations: components["schemas"]["LaneStations"];
-            track_agreement: components["schemas"]["TrackAgreementDocument"] | null;
+            track_agreement: components["schemas"]["TrackAgreement"] | null;
         };
-        DecodeDocument: {
-            attempts: number;
-            codebook_plates?: number;
-            codebook_tags?: number;
-            context: {
-                [key: string]: components["schemas"]["JsonValue"];
-            };
-            /** Format: date-time */
-            created_at: string;
-            crossings?: components["schemas"]["CrossingDocument"][];
-            decoder?: string;
-            error: components["schemas"]["ErrorDocument"] | null;
-            file_name: string | null;
-            finished_at: string | null;
-            fix?: components["schemas"]["FixDocument"] | components["schemas"]["TagFixDocument"] | null;
-            frames?: components["schemas"]["FrameDocument"][];
-            gaps?: components["schemas"]["GapDocument"][];
-            id: string;
-            kind: components["schemas"]["DecodeKind"];
-            lane?: components["schemas"]["DecodedLaneDocument"];
-            links: components["schemas"]["DecodeLinks"];
-            magnets?: components["schemas"]["PassedMagnetDocument"][];
-            markers?: components["schemas"]["ReceivedMarkerDocument"][];
-            motion?: components["schemas"]["TraceMotionDocument"];
-            noise?: components["schemas"]["NoiseDocument"][];
-            overlay?: components["schemas"]["OverlayDocument"] | null;
-            partial?: boolean;
-            path_loss?: components["schemas"]["PathLossDocument"] | null;
-            plates?: components["schemas"]["SeenPlateDocument"][];
-            progress: number;
-            readings?: (components["schemas"]["PlateReadingDocumentInFrame"] | components["schemas"]["FiducialReadingDocumentInFrame"])[];
-            receiver?: components["schemas"]["ReceiverPositions"] | null;
-            report?: components["schemas"]["TraceReportDocument"] | components["schemas"]["PacketReportDocument"];
-            /** @enum {string} */
-            state: "queued" | "running" | "done" | "failed" | "cancelled";
-            steering?: components["schemas"]["SteeringDocument"] | null;
-            summary?: components["schemas"]["FrameSummary"] | components["schemas"]["TraceSummary"] | components["schemas"]["PacketSummary"];
-            tags?: components["schemas"]["TagDocument"][];
-            upload_bytes: number | null;
-            warnings?: string[];
-        };
+        DecodeDocument: components["schemas"]["FramesDecode"] | components["schemas"]["TraceDecode"] | components["schemas"]["PacketsDecode"];
         DecodeHead: {
             attempts: number;
             context: {
@@ -3684,19 +3634,26 @@ export interface components {
             self: string;
         };
         DriveMarker: {
-            across_m: number | null;
-            along_m: number | null;
+            /** @default null */
+            across_m?: number | null;
+            /** @default null */
+            along_m?: number | null;
             decode_id: string;
             detail: string | null;
-            distance: number | null;
+            /** @default null */
+            distance?: number | null;
             family: string;
-            lat_deg: number | null;
-            lon_deg: number | null;
+            /** @default null */
+            lat_deg?: number | null;
+            /** @default null */
+            lon_deg?: number | null;
             marker_id: string | null;
-            number: number | null;
+            /** @default null */
+            number?: number | null;
             place: number;
-            reason: string | null;
-            time: string | null;
+            reason: components["schemas"]["LeftOutReason"] | null;
+            /** @default null */
+            time?: string | null;
             used: boolean;
         };
         DriveOptions: {
@@ -3720,19 +3677,11 @@ export interface components {
         DrivePage: {
             items: components["schemas"]["DriveHead"][];
         };
-        DriveReceiver: {
-            assumed_m: number;
-            clock: string;
-            decode_id: string;
-            left_out: number;
-            stated_m: number;
-            used: number;
-        };
         DriveReport: {
             clocks: components["schemas"]["ClockDocument"][];
             gaps: components["schemas"]["DriveGap"][];
             markers: components["schemas"]["DriveMarker"][];
-            receivers: components["schemas"]["DriveReceiver"][];
+            receivers: components["schemas"]["ReceiverResult"][];
             statistics: components["schemas"]["DriveStatistics"];
             summary: string;
             warnings: string[];
@@ -3793,7 +3742,7 @@ export interface components {
             kind: string;
             limit?: string;
         };
-        EstimateDocument: {
+        Estimate: {
             high: number;
             low: number;
             value: number;
@@ -3963,7 +3912,7 @@ export interface components {
             frame: number;
             match: components["schemas"]["MatchDocument"] | null;
             outcome: string;
-            pose: components["schemas"]["PoseDocument"] | null;
+            pose: components["schemas"]["PlatePose"] | null;
             reason: string | null;
             scheme: string | null;
             side_px: number;
@@ -4149,6 +4098,39 @@ export interface components {
             lon_deg: number;
             source: string;
             speed_m_s: number | null;
+        };
+        FramesDecode: {
+            attempts: number;
+            codebook_plates?: number;
+            context: {
+                [key: string]: components["schemas"]["JsonValue"];
+            };
+            /** Format: date-time */
+            created_at: string;
+            decoder?: string;
+            error: components["schemas"]["ErrorDocument"] | null;
+            file_name: string | null;
+            finished_at: string | null;
+            fix?: components["schemas"]["FixDocument"] | null;
+            frames?: components["schemas"]["FrameDocument"][];
+            gaps?: components["schemas"]["GapDocument"][];
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "archive" | "frame" | "video";
+            links: components["schemas"]["DecodeLinks"];
+            partial?: boolean;
+            plates?: components["schemas"]["SeenPlateDocument"][];
+            progress: number;
+            readings?: (components["schemas"]["PlateReadingDocumentInFrame"] | components["schemas"]["FiducialReadingDocumentInFrame"])[];
+            receiver?: components["schemas"]["ReceiverPositions"] | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            summary?: components["schemas"]["FrameSummary"];
+            upload_bytes: number | null;
+            warnings?: string[];
         };
         FrameSummary: {
             fixes: number;
@@ -4425,6 +4407,14 @@ export interface components {
             vertical_datum?: string | null;
             vertical_rmse_m?: number | null;
         };
+        LaneInFrame: {
+            area_px: number[][][];
+            centre_px: number[][][];
+            frame: string;
+            left_px: number[][][];
+            markers_px: number[][];
+            right_px: number[][][];
+        };
         LaneProfile: {
             chainage_m: number[];
             curvature_per_m: number[];
@@ -4480,11 +4470,21 @@ export interface components {
             reason: string;
             what: string;
         };
+        /** @enum {string} */
+        LeftOutReason: "outlier" | "no-time" | "no-position-grade" | "ambiguous-match" | "not-registered" | "implausible-match" | "status" | "no-fix" | "off-lane";
         LeftOutRows: {
             count: number;
             part: string;
             reason: string;
             what: string;
+        };
+        LineCrossing: {
+            confidence: number;
+            lateral_cm: number;
+            odometer_m: number;
+            side: components["schemas"]["Side"];
+            style: components["schemas"]["LineStyle"];
+            t_s: number;
         };
         LineIn: {
             /** @default 0 */
@@ -4633,6 +4633,33 @@ export interface components {
             status?: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             tag?: components["schemas"]["TagIn"] | null;
         };
+        MagnetReading: {
+            along_std_m?: number | null;
+            /** @default 0 */
+            clearance_cm?: number;
+            confidence: number;
+            lateral_cm: number;
+            /**
+             * @default [
+             *       0,
+             *       0,
+             *       0
+             *     ]
+             */
+            moment_am2?: [
+                number,
+                number,
+                number
+            ];
+            odometer_m: number;
+            phi_deg: components["schemas"]["Orientation"];
+            polarity: components["schemas"]["Polarity"];
+            /** @default 0 */
+            relative_std_m?: number;
+            /** @default 0 */
+            snr?: number;
+            t_s: number;
+        };
         MaintenanceItem: {
             code: string | null;
             /** Format: date-time */
@@ -4737,6 +4764,10 @@ export interface components {
             registered: boolean;
             status: string | null;
         };
+        Meaning: {
+            kind: components["schemas"]["MeaningKind"];
+            value: number | string;
+        };
         MeaningDocument: {
             kind: string;
             text: string;
@@ -4747,6 +4778,8 @@ export interface components {
             kind: string;
             value: number | string;
         };
+        /** @enum {string} */
+        MeaningKind: "arrow" | "stop-line-ahead" | "speed-limit-kmh" | "speed-limit-mph" | "bend-left" | "bend-right" | "notice";
         MeaningsIn: {
             meanings: components["schemas"]["MeaningIn"][];
         };
@@ -4850,13 +4883,15 @@ export interface components {
             url: string;
             who: string;
         };
-        NoiseDocument: {
-            kind: string;
+        NoiseFinding: {
+            kind: components["schemas"]["NoiseKind"];
             lateral_cm: number;
             odometer_m: number;
             reason: string;
             t_s: number;
         };
+        /** @enum {string} */
+        NoiseKind: "ferrous-object" | "moment-unlike-a-magnet" | "not-on-the-road-surface" | "clearance-not-known" | "neither-upright-nor-forward" | "too-weak-to-be-sure" | "beside-the-bar" | "gap-in-the-trace" | "sensor-fault";
         NssdaDocument: {
             horizontal_95_m: number | null;
             is_tested: boolean;
@@ -4908,17 +4943,11 @@ export interface components {
             /** @default 10 */
             rate_hz?: number;
         };
+        /** @enum {integer} */
+        Orientation: 0 | 90;
         Origin: {
             lat_deg: number;
             lon_deg: number;
-        };
-        OverlayDocument: {
-            area_px: number[][][];
-            centre_px: number[][][];
-            frame: string;
-            left_px: number[][][];
-            markers_px: number[][];
-            right_px: number[][][];
         };
         PackageIn: {
             crs?: string | null;
@@ -4962,6 +4991,37 @@ export interface components {
             verify_ms: number;
             warnings: string[];
         };
+        PacketsDecode: {
+            attempts: number;
+            context: {
+                [key: string]: components["schemas"]["JsonValue"];
+            };
+            /** Format: date-time */
+            created_at: string;
+            decoder?: string;
+            error: components["schemas"]["ErrorDocument"] | null;
+            file_name: string | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "packets";
+            lane?: components["schemas"]["DecodedLaneDocument"];
+            links: components["schemas"]["DecodeLinks"];
+            markers?: components["schemas"]["ReceivedMarkerDocument"][];
+            overlay?: components["schemas"]["LaneInFrame"] | null;
+            path_loss?: components["schemas"]["PathLoss"] | null;
+            progress: number;
+            receiver?: components["schemas"]["ReceiverPositions"] | null;
+            report?: components["schemas"]["PacketReportDocument"];
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            steering?: components["schemas"]["SteeringDocument"] | null;
+            summary?: components["schemas"]["PacketSummary"];
+            upload_bytes: number | null;
+        };
         PacketsDocument: {
             entry: number[];
             lat_deg: (number | null)[];
@@ -5001,16 +5061,6 @@ export interface components {
             method: "s3-parts";
             size: number;
         };
-        PassedMagnetDocument: {
-            along_std_m?: number | null;
-            clearance_cm: number;
-            confidence: number;
-            lateral_cm: number;
-            odometer_m: number;
-            phi_deg: number;
-            polarity: string;
-            t_s: number;
-        };
         PassFrameDocument: {
             ahead_m: number;
             blur_px: number;
@@ -5024,11 +5074,12 @@ export interface components {
             read_rate: number;
             will_be_read: boolean;
         };
-        PathLossDocument: {
-            exponent: components["schemas"]["EstimateDocument"];
+        PathLoss: {
+            exponent: components["schemas"]["Estimate"];
             fitted_exponent: boolean;
-            level_at_50m_dbm: components["schemas"]["EstimateDocument"];
+            level_at_50m_dbm: components["schemas"]["Estimate"];
             packets: number;
+            sensitivity_dbm: number;
             spread_db: number;
         };
         PayloadDocument: {
@@ -5280,7 +5331,7 @@ export interface components {
             thickness_mm: number;
             unit_mm: number;
         };
-        PlateGradeDocument: {
+        PlateGrade: {
             axial_nonuniformity: number;
             contrast: number;
             fixed_pattern: number;
@@ -5312,6 +5363,12 @@ export interface components {
              */
             status?: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
         };
+        PlatePose: {
+            covariance: number[][];
+            reprojection_rms_px: number;
+            rotation: number[][];
+            translation_m: number[];
+        };
         PlateReadingDocumentInFrame: {
             cell_confidence: number[];
             certainty: string | null;
@@ -5331,12 +5388,12 @@ export interface components {
             frame: number;
             from_codebook: boolean;
             geometry: components["schemas"]["ReadGeometryDocument"] | null;
-            grade: components["schemas"]["PlateGradeDocument"] | null;
+            grade: components["schemas"]["PlateGrade"] | null;
             height_px: number;
             likely_digits: string | null;
             match: components["schemas"]["MatchDocument"] | null;
             outcome: string;
-            pose: components["schemas"]["PoseDocument"] | null;
+            pose: components["schemas"]["PlatePose"] | null;
             possible_schemes: components["schemas"]["PossibleSchemeDocument"][];
             reason: string | null;
             registry_number: number | null;
@@ -5347,6 +5404,8 @@ export interface components {
             height_mm: number;
             width_mm: number;
         };
+        /** @enum {string} */
+        Polarity: "N" | "S";
         PolygonIn: {
             coordinates: number[][][];
             /**
@@ -5372,12 +5431,6 @@ export interface components {
             forward_m?: number | null;
             /** @default null */
             left_m?: number | null;
-        };
-        PoseDocument: {
-            covariance: number[][];
-            reprojection_rms_px: number;
-            rotation: number[][];
-            translation_m: number[];
         };
         PositionDocument: {
             check_points: number | null;
@@ -5833,6 +5886,14 @@ export interface components {
             lon_deg: number[];
             time_s: number[];
         };
+        ReceiverResult: {
+            assumed_m: number;
+            clock: string;
+            decode_id: string;
+            left_out: number;
+            stated_m: number;
+            used: number;
+        };
         RecommendationDocument: {
             battery_days: number;
             radio: components["schemas"]["RadioSettingsDocument"] | null;
@@ -6251,6 +6312,8 @@ export interface components {
             height_mm: number;
             width_mm: number;
         };
+        /** @enum {string} */
+        Side: "left" | "right";
         SigmaDocument: {
             east_m: number;
             heading_deg: number;
@@ -6366,7 +6429,7 @@ export interface components {
             direction: "legal" | "wrong-way" | "unknown";
             end_s: number;
             extra: number;
-            fix: components["schemas"]["TagFixDocument"] | null;
+            fix: components["schemas"]["TagFix"] | null;
             gap_std_m: number[];
             gaps_m: number[];
             lateral_cm: number;
@@ -6380,12 +6443,12 @@ export interface components {
             tag: string | null;
             tuple: string | null;
         };
-        TagFixDocument: {
+        TagFix: {
             across_m: number;
             covariance: number[][];
             heading_deg: number;
             lat_deg: number;
-            localization_grade: string;
+            localization_grade: components["schemas"]["LocalizationGrade"];
             lon_deg: number;
             notes: string[];
             sigma: components["schemas"]["TagFixSigma"];
@@ -6416,7 +6479,7 @@ export interface components {
             ambiguous: boolean;
             localization_grade: string | null;
             marker_id: string | null;
-            meaning: components["schemas"]["CodeMeaningDocument"] | null;
+            meaning: components["schemas"]["Meaning"] | null;
             note: string | null;
             other_marker_ids: string[];
             registered: boolean;
@@ -6528,38 +6591,82 @@ export interface components {
              */
             time_unit?: "s" | "ms" | "us" | "ns" | "iso";
         };
-        TraceGapDocument: {
+        TraceDecode: {
+            attempts: number;
+            codebook_tags?: number;
+            context: {
+                [key: string]: components["schemas"]["JsonValue"];
+            };
+            /** Format: date-time */
+            created_at: string;
+            crossings?: components["schemas"]["LineCrossing"][];
+            decoder?: string;
+            error: components["schemas"]["ErrorDocument"] | null;
+            file_name: string | null;
+            finished_at: string | null;
+            fix?: components["schemas"]["TagFix"] | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "trace";
+            links: components["schemas"]["DecodeLinks"];
+            magnets?: components["schemas"]["MagnetReading"][];
+            motion?: components["schemas"]["TraceMotion"];
+            noise?: components["schemas"]["NoiseFinding"][];
+            progress: number;
+            report?: components["schemas"]["TraceReport"];
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            summary?: components["schemas"]["TraceSummary"];
+            tags?: components["schemas"]["TagDocument"][];
+            upload_bytes: number | null;
+        };
+        /** @enum {string} */
+        TraceFormat: "metro-stream" | "recorder-raw-data" | "recorder-speed" | "recorder-steering-wheel-angle" | "csv" | "parquet" | "can-log" | "dbc" | "bag";
+        TraceGap: {
             lost_s: number;
             part: string;
             sample: number;
-            skipped_bytes: number;
+            /** @default 0 */
+            skipped_bytes?: number;
             t_s: number;
         };
-        TraceMotionDocument: {
+        TraceMotion: {
             heading_deg: (number | null)[];
             speed_m_s: (number | null)[];
             start_s: number;
             step_s: number;
         };
-        TraceReportDocument: {
-            clock_offsets_s: {
+        TraceReport: {
+            clock_offsets_s?: {
                 [key: string]: number;
             };
-            decode_ms: number;
-            driven_m: number;
-            duration_s: number;
-            formats: {
-                [key: string]: string;
+            /** @default 0 */
+            decode_ms?: number;
+            /** @default 0 */
+            driven_m?: number;
+            /** @default 0 */
+            duration_s?: number;
+            formats?: {
+                [key: string]: components["schemas"]["TraceFormat"];
             };
-            gap_count: number;
-            gaps: components["schemas"]["TraceGapDocument"][];
-            heading_coverage: number;
-            left_out: components["schemas"]["LeftOutRows"][];
-            load_ms: number;
-            rate_hz: number;
-            samples: number;
-            speed_coverage: number;
-            warnings: string[];
+            /** @default 0 */
+            gap_count?: number;
+            gaps?: components["schemas"]["TraceGap"][];
+            /** @default 0 */
+            heading_coverage?: number;
+            left_out?: components["schemas"]["LeftOutRows"][];
+            /** @default 0 */
+            load_ms?: number;
+            /** @default 0 */
+            rate_hz?: number;
+            /** @default 0 */
+            samples?: number;
+            /** @default 0 */
+            speed_coverage?: number;
+            warnings?: string[];
         };
         TraceSummary: {
             crossings: number;
@@ -6573,9 +6680,10 @@ export interface components {
             text: string;
             wrong_way: number;
         };
-        TrackAgreementDocument: {
+        TrackAgreement: {
             disagrees: boolean;
             east_m: number;
+            effect_m: number;
             north_m: number;
             scale_ppm: number;
             scale_sigma_ppm: number;

@@ -84,8 +84,8 @@ def test_weak_packets_that_are_never_heard_do_not_flatten_the_line() -> None:
     assert slope < EXPONENT - 0.3  # least squares
     assert line.exponent.value == pytest.approx(EXPONENT, abs=0.2)
     assert line.exponent.low < EXPONENT < line.exponent.high
-    assert line.level_dbm.low < -108 < line.level_dbm.high
-    assert line.level_dbm.high - line.level_dbm.low < 3
+    assert line.level_at_50m_dbm.low < -108 < line.level_at_50m_dbm.high
+    assert line.level_at_50m_dbm.high - line.level_at_50m_dbm.low < 3
     assert line.spread_db == pytest.approx(4.5, abs=0.6)
     assert line.sensitivity_dbm == pytest.approx(SENSITIVITY_DBM, abs=1.5)
     assert line.at_1m_dbm == pytest.approx(-108 + 10 * EXPONENT * math.log10(50), abs=4)
@@ -98,7 +98,7 @@ def test_strays_do_not_move_the_line() -> None:
     line = fit_path_loss(distance, rssi, rng.integers(0, 30, len(rssi)), SENSITIVITY_DBM)
     assert line is not None
     assert line.exponent.value == pytest.approx(EXPONENT, abs=0.3)
-    assert line.level_dbm.value == pytest.approx(-108, abs=1.2)
+    assert line.level_at_50m_dbm.value == pytest.approx(-108, abs=1.2)
 
 
 def test_intervals_hold_what_they_promise() -> None:
@@ -108,7 +108,7 @@ def test_intervals_hold_what_they_promise() -> None:
         line = profile_signals(packets, places, track).path_loss
         assert line is not None
         held += [
-            line.level_dbm.low <= -108 <= line.level_dbm.high,
+            line.level_at_50m_dbm.low <= -108 <= line.level_at_50m_dbm.high,
             line.exponent.low <= EXPONENT <= line.exponent.high,
         ]
     assert (held >= 35).all()  # 38 of 40 are promised
@@ -118,7 +118,7 @@ def test_a_sensitivity_that_cannot_be_told_does_not_run_away() -> None:
     packets, places, track = drive(1302)  # it did, to 4040 dBm
     line = profile_signals(packets, places, track).path_loss
     assert line is not None
-    assert line.level_dbm.value == pytest.approx(-108, abs=3)
+    assert line.level_at_50m_dbm.value == pytest.approx(-108, abs=3)
 
 
 def test_distances_that_are_all_alike_tell_no_exponent() -> None:
@@ -127,7 +127,7 @@ def test_distances_that_are_all_alike_tell_no_exponent() -> None:
     assert line is not None
     assert not line.fitted_exponent
     assert line.exponent.value == EXPONENT
-    assert line.level_dbm.value == pytest.approx(-108, abs=2)
+    assert line.level_at_50m_dbm.value == pytest.approx(-108, abs=2)
     assert fit_path_loss(np.full(19, 50.0), np.full(19, -108.0), np.zeros(19)) is None
 
 

@@ -41,7 +41,7 @@ def right_and_other(drive: SimulatedDrive, findings: Sequence[Finding]) -> tuple
         any(
             abs(r.t_s - m.t_s) * m.speed_m_s < 0.15
             and abs(r.lateral_cm - m.lateral_cm) < 8
-            and (r.polarity, r.orientation) == (m.polarity, m.orientation)
+            and (r.polarity, r.phi_deg) == (m.polarity, m.orientation)
             for r in readings
         )
         for m in drive.magnets
@@ -82,7 +82,7 @@ def test_a_line_is_not_learnt_as_the_noise_of_a_wheel_whose_turn_is_about_as_lon
     drive = simulate_drive(scene, np.random.default_rng(23))
     findings = [f for f in decode_trace(drive.trace, BAR) if isinstance(f, MagnetReading)]
     assert len(findings) >= 0.95 * len(lines)
-    assert {(f.orientation, f.polarity) for f in findings} == {(Orientation.UP, Polarity.N)}
+    assert {(f.phi_deg, f.polarity) for f in findings} == {(Orientation.UP, Polarity.N)}
 
 
 @pytest.mark.slow

@@ -95,4 +95,4 @@ def test_an_upright_magnet_is_a_line() -> None:
     drive = simulate_drive(Scene(Road(90), vehicle, lines=lines), np.random.default_rng(3))
     found = decode_trace_metro(drive.trace, vehicle.bar)
     magnets = [f for f in found if isinstance(f, MagnetReading)]
-    assert [(m.polarity, m.orientation) for m in magnets] == [(Polarity.S, Orientation.UP)]
+    assert [(m.polarity, m.phi_deg) for m in magnets] == [(Polarity.S, Orientation.UP)]

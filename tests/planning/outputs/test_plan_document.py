@@ -72,7 +72,7 @@ def test_a_plan_comes_back_as_it_was() -> None:
 def test_a_plan_of_an_earlier_release_is_read() -> None:
     plan = full_plan()
     written = write_plan(plan)
-    older = written.replace(b"_m_s2\"", b"_mps2\"").replace(b"speed_m_s\"", b"speed_mps\"")
+    older = written.replace(b'_m_s2"', b'_mps2"').replace(b'speed_m_s"', b'speed_mps"')
     assert older != written
     assert write_plan(read_plan(older)) == written
 
