@@ -5,14 +5,19 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal, NotRequired
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
+from pydantic import AfterValidator, BaseModel, Field, JsonValue
 from typing_extensions import ReadOnly, TypedDict
 
 from app.errors import InvalidParameter, ReferenceSystemError
-from app.families.surveys import NewMarker
 from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
 from app.geodesy.systems import normalize_vertical_datum
+from app.inputs import Flag as Flag
+from app.inputs import Identifier as Identifier
+from app.inputs import Number as Number
+from app.inputs import StrictModel as StrictModel
+from app.inputs import Text as Text
+from app.inputs import Whole as Whole
 from app.markers.reading import Status
 from app.registry.conditions import grade_columns
 from app.registry.marker_rows import MarkerRow
@@ -122,12 +127,6 @@ def marker_place(row: MarkerRow) -> MarkerPlace:
 # === Schemas of requests that register or change markers: what every family shares.
 
 
-def _plain_text(text: str) -> str:
-    if "\x00" in text:
-        raise ValueError("a text holds no NUL")
-    return text
-
-
 def _vertical_datum(text: str) -> str:
     try:
         return normalize_vertical_datum(text)
@@ -136,11 +135,6 @@ def _vertical_datum(text: str) -> str:
         raise
 
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Whole = Annotated[int, Field(strict=True)]
-Flag = Annotated[bool, Field(strict=True)]
-Text = Annotated[str, AfterValidator(_plain_text)]
-Identifier = Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
 VerticalDatum = Annotated[Text, Field(min_length=1, max_length=64), AfterValidator(_vertical_datum)]
 VersionKind = Literal["as-planned", "as-built", "resurvey", "correction", "change"]
 Heading = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, lt=360)]
@@ -149,12 +143,6 @@ Metres = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e8, le=1e
 Height = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-12_000, le=100_000)]
 CheckPoints = Annotated[int, Field(strict=True, ge=0, le=10**6)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class StrictModel(BaseModel):
-    """Base of every part of a request: members that it does not know are refused."""
-
-    model_config = ConfigDict(extra="forbid")
 
 
 class _CoordinatesIn(StrictModel):
@@ -209,23 +197,14 @@ class MarkerIn(PlacementIn):
     family: str
     status: Status = "planned"
 
-    def new(self) -> NewMarker:
-        """The marker as the use cases know it."""
-        raise NotImplementedError
-
-    def shared(self) -> dict[str, Any]:
-        """Members that markers of every family have, for `NewMarker`."""
-        return self.model_dump(
-            include={"status", "heading_rmse_deg", "road", "measure_m", "offset_m", "kind", "reason"}
-        )
+    @property
+    def part_count(self) -> int:
+        """Things in the road that the marker has at most, e.g. magnets: what its registration costs."""
+        return 1
 
 
 class FamilyChange(BaseModel):
     """Members of a change that only one family has; they are kept in the marker's spec."""
-
-    def spec_changes(self, named: set[str]) -> dict[str, Any]:
-        """Members of the spec that a change replaces, of those that the request names."""
-        raise NotImplementedError
 
 
 class Headed(PlacementIn):
@@ -284,8 +263,8 @@ def place_input(position: PositionIn, accuracy_m: float) -> PlacedPosition:
     )
 
 
-def position_columns(position: PositionIn, placed: PlacedPosition) -> dict[str, Any]:
-    """Columns of a marker that keep its position and where it comes from."""
+def position_columns(position: ProvenanceIn, placed: PlacedPosition) -> dict[str, Any]:
+    """Columns of a marker that keep its position, or the first one of its lane, and where it comes from."""
     return {
         "lon_deg": placed.lon_deg,
         "lat_deg": placed.lat_deg,
@@ -301,6 +280,6 @@ def position_columns(position: PositionIn, placed: PlacedPosition) -> dict[str, 
         "surveyor": position.surveyor,
         "instrument": position.instrument,
         "survey_file_sha256": position.survey_file_sha256,
-        "original": position.model_dump(exclude_none=True),
+        "original": position.model_dump(exclude_none=True, exclude={"geometry", "points_m"}),
         **grade_columns(position.horizontal_rmse_m, placed.transform_accuracy_m, placed.note),
     }

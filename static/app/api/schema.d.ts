@@ -2533,6 +2533,7 @@ export type webhooks = Record<string, never>;
 export interface components {
     schemas: {
         AcceptanceIn: {
+            /** @default null */
             note?: string | null;
         };
         AccuracyDocument: {
@@ -2623,6 +2624,7 @@ export interface components {
             geometry: components["schemas"]["GeoLineIn"];
         };
         ApprovalIn: {
+            /** @default null */
             note?: string | null;
             /** @enum {string} */
             outcome: "suspect" | "retired" | "resurvey" | "none";
@@ -2630,6 +2632,7 @@ export interface components {
         /** @enum {string} */
         ArtworkFormat: "svg" | "pdf" | "dxf" | "png";
         ArtworkIn: {
+            /** @default null */
             bbox?: number[] | null;
             /**
              * @default [
@@ -2642,10 +2645,13 @@ export interface components {
             heaters?: boolean;
             /** @default false */
             leds?: boolean;
+            /** @default null */
             marker_ids?: string[] | null;
             /** @default 150 */
             resolution_dpi?: number;
+            /** @default null */
             sheet?: components["schemas"]["SheetIn"] | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
         };
         AsBuiltDocument: {
@@ -2854,29 +2860,19 @@ export interface components {
             /** @default null */
             width_px?: number | null;
         };
-        CameraPassDocument: {
+        CameraPass: {
             best_unit_px: number;
             blur_mm: number;
             blur_units: number;
             far_m: number | null;
-            frames: components["schemas"]["PassFrameDocument"][];
+            frames: components["schemas"]["PassFrame"][];
             listed_every: number;
             min_read_rate: number;
             near_m: number | null;
-            read_rates: components["schemas"]["PassRateDocument"][];
+            read_rates: components["schemas"]["PassRate"][];
             readable_frames_per_pass: number;
             speed_kmh: number;
             step_m: number;
-        };
-        CameraPassIn: {
-            camera?: components["schemas"]["CameraRules"];
-            code?: components["schemas"]["CodeIn"];
-            geometry?: components["schemas"]["GeometryIn"];
-            /** @default 0 */
-            left_m?: number;
-            position?: components["schemas"]["PositionIn"] | null;
-            /** @default 60 */
-            speed_kmh?: number;
         };
         CameraRules: {
             /** @default 23 */
@@ -2904,23 +2900,6 @@ export interface components {
             distortion: number[];
             fx_px: number;
             fy_px: number;
-        };
-        CameraViewIn: {
-            /** @default 4 */
-            ahead_m?: number;
-            camera?: components["schemas"]["CameraRules"];
-            code?: components["schemas"]["CodeIn"];
-            /**
-             * @default day
-             * @enum {string}
-             */
-            condition?: "day" | "night" | "rain" | "shade" | "wear" | "dirt";
-            geometry?: components["schemas"]["GeometryIn"];
-            /** @default 0 */
-            left_m?: number;
-            position?: components["schemas"]["PositionIn"] | null;
-            /** @default 60 */
-            speed_kmh?: number;
         };
         CanIn: {
             /** @default null */
@@ -2982,11 +2961,11 @@ export interface components {
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
             position_warnings?: components["schemas"]["WarningDocument"][];
-            radio: components["schemas"]["RadioDocument"];
+            radio: components["schemas"]["RadioSettings-Output"];
             road: string | null;
             /** @enum {string} */
             side: "left" | "right" | "unknown";
-            speed_limit: components["schemas"]["SpeedLimitDocument"] | null;
+            speed_limit: components["schemas"]["SpeedLimit-Output"] | null;
             /** @enum {string} */
             status: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             /** Format: date-time */
@@ -2994,25 +2973,35 @@ export interface components {
             version: number;
         };
         CerpmIn: {
+            /** @default null */
             dev_eui?: string | null;
             /** @constant */
             family: "cerpm";
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             number?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position: components["schemas"]["PositionIn"];
-            radio?: components["schemas"]["RadioIn"];
+            radio?: components["schemas"]["RadioSettings-Input"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default unknown
              * @enum {string}
              */
             side?: "left" | "right" | "unknown";
-            speed_limit?: components["schemas"]["SpeedLimitIn"] | null;
+            /** @default null */
+            speed_limit?: components["schemas"]["SpeedLimit-Input"] | null;
             /**
              * @default planned
              * @enum {string}
@@ -3052,13 +3041,7 @@ export interface components {
             updated_at: string;
             version: number;
         };
-        CheckComparison: {
-            built: components["schemas"]["FindingDocument"] | null;
-            name: string;
-            planned: components["schemas"]["FindingDocument"] | null;
-            verdict_changed: boolean;
-        };
-        CheckDocument: {
+        Check: {
             figure: number;
             limit: number;
             name: string;
@@ -3068,6 +3051,12 @@ export interface components {
             relation: ">=" | "<=";
             source: string;
             unit: string;
+        };
+        CheckComparison: {
+            built: components["schemas"]["FindingDocument"] | null;
+            name: string;
+            planned: components["schemas"]["FindingDocument"] | null;
+            verdict_changed: boolean;
         };
         CheckFigure: {
             figure: number;
@@ -3105,45 +3094,71 @@ export interface components {
         CodebookDocument: {
             /** Format: date-time */
             created_at: string;
-            design: components["schemas"]["DesignDocument"];
+            design: components["schemas"]["TagDesign-Output"];
             entries: components["schemas"]["EntryDocument"][];
             entry_count: number;
             figures: components["schemas"]["FiguresDocument"];
             id: string;
             name: string;
-            rules: components["schemas"]["RulesDocument"];
+            rules: components["schemas"]["CodebookRules-Output"];
             /** Format: date-time */
             updated_at: string;
             version: number;
         };
         CodebookDraftDocument: {
             codes: components["schemas"]["CodeDocument"][];
-            design: components["schemas"]["DesignDocument"];
+            design: components["schemas"]["TagDesign-Output"];
             figures: components["schemas"]["FiguresDocument"];
-            rules: components["schemas"]["RulesDocument"];
+            rules: components["schemas"]["CodebookRules-Output"];
         };
         CodebookDraftIn: {
-            design: components["schemas"]["DesignIn"];
-            rules?: components["schemas"]["RulesIn"];
+            design: components["schemas"]["TagDesign-Input"];
+            rules?: components["schemas"]["CodebookRules-Input"];
         };
         CodebookIn: {
-            design: components["schemas"]["DesignIn"];
-            meanings?: components["schemas"]["MeaningIn"][];
+            design: components["schemas"]["TagDesign-Input"];
+            meanings?: components["schemas"]["Meaning"][];
             name: string;
-            rules?: components["schemas"]["RulesIn"];
+            rules?: components["schemas"]["CodebookRules-Input"];
         };
         CodebookPage: {
             items: components["schemas"]["CodebookSummary"][];
         };
+        "CodebookRules-Input": {
+            /** @default 0.3 */
+            clearance_m?: number;
+            /** @default 0.001 */
+            confusion?: number;
+            odometer?: components["schemas"]["OdometerError-Input"];
+            /** @default 13.4 */
+            speed_m_s?: number;
+            /** @default false */
+            survive_missing?: boolean;
+            /** @default false */
+            wrong_way_safe?: boolean;
+        };
+        "CodebookRules-Output": {
+            /** @default 0.3 */
+            clearance_m: number;
+            /** @default 0.001 */
+            confusion: number;
+            odometer: components["schemas"]["OdometerError-Output"];
+            /** @default 13.4 */
+            speed_m_s: number;
+            /** @default false */
+            survive_missing: boolean;
+            /** @default false */
+            wrong_way_safe: boolean;
+        };
         CodebookSummary: {
             /** Format: date-time */
             created_at: string;
-            design: components["schemas"]["DesignDocument"];
+            design: components["schemas"]["TagDesign-Output"];
             entry_count: number;
             figures: components["schemas"]["FiguresDocument"];
             id: string;
             name: string;
-            rules: components["schemas"]["RulesDocument"];
+            rules: components["schemas"]["CodebookRules-Output"];
             /** Format: date-time */
             updated_at: string;
             version: number;
@@ -3152,17 +3167,17 @@ export interface components {
             code: string;
             tuple: string;
         };
-        CodeIn: {
+        CodeInput: {
             /** @default false */
             allow_mismatched_digits?: boolean;
+            /** @default null */
             check_digits?: number | null;
+            /** @default null */
             digits?: string | null;
+            /** @default null */
             registry_number?: number | null;
-            /**
-             * @default id
-             * @enum {string}
-             */
-            scheme?: "id" | "position-robust" | "position-check" | "position";
+            /** @default id */
+            scheme?: components["schemas"]["PlateScheme"];
         };
         CodeMeaningDocument: {
             kind: string;
@@ -3267,6 +3282,8 @@ export interface components {
         CompleteIn: {
             etags: string[];
         };
+        /** @enum {string} */
+        Condition: "day" | "night" | "rain" | "shade" | "wear" | "dirt";
         Conformance: {
             conformsTo: string[];
         };
@@ -3413,20 +3430,17 @@ export interface components {
             reason?: string | null;
             /** @default null */
             road?: string | null;
-            /**
-             * @default id
-             * @enum {string}
-             */
-            scheme?: "id" | "position-robust" | "position-check" | "position";
+            /** @default id */
+            scheme?: components["schemas"]["PlateScheme"];
             /**
              * @default unknown
              * @enum {string}
              */
-            side?: "unknown" | "left" | "right";
+            side?: "left" | "right" | "unknown";
             /** @default null */
             sign?: components["schemas"]["SignIn"] | null;
             /** @default null */
-            speed_limit?: components["schemas"]["SpeedLimitIn"] | null;
+            speed_limit?: components["schemas"]["SpeedLimit-Input"] | null;
             /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
             survey?: components["schemas"]["SurveyIn"];
@@ -3564,19 +3578,6 @@ export interface components {
         DeliveryPage: {
             items: components["schemas"]["DeliveryDocument"][];
         };
-        DesignDocument: {
-            length_m: number;
-            magnets: number;
-            min_gap_m: number;
-            segment_m: number;
-        };
-        DesignIn: {
-            length_m: number;
-            magnets: number;
-            /** @default 0.5 */
-            min_gap_m?: number;
-            segment_m: number;
-        };
         DetectedDocument: {
             evidence: string;
             value: string;
@@ -3590,23 +3591,12 @@ export interface components {
         DismissalIn: {
             note: string;
         };
-        DistinguishableDocument: {
+        Distinguishable: {
             accuracy: number;
             codes: number;
             mean_accuracy: number;
             share: number;
             worst_accuracy: number;
-        };
-        DraftArtworkIn: {
-            code?: components["schemas"]["CodeIn"];
-            geometry?: components["schemas"]["GeometryIn"];
-            /** @default false */
-            heaters?: boolean;
-            /** @default false */
-            leds?: boolean;
-            position?: components["schemas"]["PositionIn"] | null;
-            /** @default 150 */
-            resolution_dpi?: number;
         };
         DraftCodeDocument: {
             bits: number;
@@ -3625,7 +3615,46 @@ export interface components {
             lat_deg: number;
             lon_deg: number;
         };
+        DraftToDraw: {
+            code?: components["schemas"]["CodeInput"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default false */
+            heaters?: boolean;
+            /** @default false */
+            leds?: boolean;
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+            /** @default 150 */
+            resolution_dpi?: number;
+        };
+        DraftToPass: {
+            camera?: components["schemas"]["CameraRules"];
+            code?: components["schemas"]["CodeInput"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default 0 */
+            left_m?: number;
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+            /** @default 60 */
+            speed_kmh?: number;
+        };
+        DraftToView: {
+            /** @default 4 */
+            ahead_m?: number;
+            camera?: components["schemas"]["CameraRules"];
+            code?: components["schemas"]["CodeInput"];
+            /** @default day */
+            condition?: components["schemas"]["Condition"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default 0 */
+            left_m?: number;
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+            /** @default 60 */
+            speed_kmh?: number;
+        };
         DriveDecodeIn: {
+            /** @default null */
             clock?: string | null;
             /** @default 0.5 */
             clock_sigma_s?: number;
@@ -3663,8 +3692,10 @@ export interface components {
         };
         DriveIn: {
             decodes: components["schemas"]["DriveDecodeIn"][];
+            /** @default null */
             name?: string | null;
             options?: components["schemas"]["DriveOptionsIn"];
+            /** @default null */
             vehicle?: string | null;
         };
         DriveLinks: {
@@ -3820,14 +3851,21 @@ export interface components {
             value: string;
         };
         ExportIn: {
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             family?: ("plate" | "magnet" | "cerpm" | "fiducial") | null;
             /** @enum {string} */
             format: "csv" | "geojson" | "gpkg" | "shapefile" | "kml" | "landxml" | "dxf";
+            /** @default null */
             from_m?: number | null;
+            /** @default null */
             polygon?: string | null;
+            /** @default null */
             road?: string | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
+            /** @default null */
             to_m?: number | null;
         };
         ExtentDocument: {
@@ -3866,15 +3904,15 @@ export interface components {
             /** @constant */
             type: "FeatureCollection";
         };
+        FiducialCode: {
+            dictionary: string;
+            number: number;
+        };
         FiducialCodeDocument: {
             dictionary: string;
             number: number;
             scheme: string;
             text: string;
-        };
-        FiducialCodeIn: {
-            dictionary: string;
-            number: number;
         };
         FiducialDocument: {
             code: components["schemas"]["FiducialCodeDocument"];
@@ -3885,7 +3923,7 @@ export interface components {
              * @enum {string}
              */
             family: "fiducial";
-            geometry: components["schemas"]["FiducialGeometryDocument"];
+            geometry: components["schemas"]["FiducialGeometry"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -3900,34 +3938,38 @@ export interface components {
             updated_at: string;
             version: number;
         };
-        FiducialGeometryDocument: {
-            /** @enum {string} */
-            mounting: "upright" | "lying";
+        FiducialGeometry: {
+            /** @default upright */
+            mounting: components["schemas"]["Mounting"];
             quiet_mm: number;
             side_mm: number;
         };
         FiducialGeometryIn: {
-            /**
-             * @default upright
-             * @enum {string}
-             */
-            mounting?: "upright" | "lying";
+            /** @default upright */
+            mounting?: components["schemas"]["Mounting"];
             /** @default null */
             quiet_mm?: number | null;
             side_mm: number;
         };
         FiducialIn: {
-            code: components["schemas"]["FiducialCodeIn"];
+            code: components["schemas"]["FiducialCode"];
             /** @constant */
             family: "fiducial";
             geometry: components["schemas"]["FiducialGeometryIn"];
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position: components["schemas"]["PositionIn"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default planned
@@ -3965,7 +4007,7 @@ export interface components {
             capacity_is_exact: boolean;
             capacity_under_rules: number;
             coupled_capacity: number;
-            distinguishable: components["schemas"]["DistinguishableDocument"];
+            distinguishable: components["schemas"]["Distinguishable"];
             ideal_capacity: number;
             wrong_way_safe_capacity: number;
         };
@@ -4023,11 +4065,11 @@ export interface components {
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
             position_warnings?: components["schemas"]["WarningDocument"][];
-            radio: components["schemas"]["RadioDocument"];
+            radio: components["schemas"]["RadioSettings-Output"];
             road: string | null;
             /** @enum {string} */
             side: "left" | "right" | "unknown";
-            speed_limit: components["schemas"]["SpeedLimitDocument"] | null;
+            speed_limit: components["schemas"]["SpeedLimit-Output"] | null;
             /** @enum {string} */
             status: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             /** Format: date-time */
@@ -4045,7 +4087,7 @@ export interface components {
              * @enum {string}
              */
             family: "fiducial";
-            geometry: components["schemas"]["FiducialGeometryDocument"];
+            geometry: components["schemas"]["FiducialGeometry"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4074,7 +4116,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
-            layout: components["schemas"]["TagPlaceDocument"] | components["schemas"]["LinePlaceDocument"];
+            layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             measure_m: number | null;
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
@@ -4371,6 +4413,7 @@ export interface components {
             valid: boolean;
         };
         KeyIn: {
+            /** @default null */
             expires_at?: string | null;
             label: string;
             scope: components["schemas"]["Scope"];
@@ -4395,19 +4438,33 @@ export interface components {
             type: "LineString";
         };
         LaneIn: {
+            /** @default null */
             check_points?: number | null;
+            /** @default null */
             crs?: string | null;
+            /** @default null */
             epoch?: number | null;
+            /** @default null */
             geometry?: components["schemas"]["LineStringIn"] | null;
+            /** @default null */
             height_m?: number | null;
+            /** @default null */
             horizontal_rmse_m?: number | null;
+            /** @default null */
             instrument?: string | null;
+            /** @default null */
             points_m?: number[][] | null;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             survey_file_sha256?: string | null;
+            /** @default null */
             survey_method?: string | null;
+            /** @default null */
             surveyor?: string | null;
+            /** @default null */
             vertical_datum?: string | null;
+            /** @default null */
             vertical_rmse_m?: number | null;
         };
         LaneProfile: {
@@ -4485,11 +4542,15 @@ export interface components {
             /** @default 6 */
             spacing_m?: number;
             style: components["schemas"]["LineStyle"];
+            /** @default null */
             to_m?: number | null;
         };
-        LinePlaceDocument: {
+        LinePlace: {
+            /** @default 0 */
             from_m: number;
+            /** @default 6 */
             spacing_m: number;
+            /** @default null */
             to_m: number | null;
         };
         LineStringIn: {
@@ -4545,7 +4606,7 @@ export interface components {
         };
         MagnetDetailDocument: {
             bill: components["schemas"]["BillDocument"];
-            checks: components["schemas"]["CheckDocument"][];
+            checks: components["schemas"]["Check"][];
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
@@ -4558,7 +4619,7 @@ export interface components {
             heading_rmse_deg: number | null;
             id: string;
             lane: components["schemas"]["LaneDocument"];
-            layout: components["schemas"]["TagPlaceDocument"] | components["schemas"]["LinePlaceDocument"];
+            layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             length_m: number;
             magnets: components["schemas"]["HoleDocument"][];
             measure_m: number | null;
@@ -4567,7 +4628,7 @@ export interface components {
             position: components["schemas"]["PositionDocument"];
             position_warnings?: components["schemas"]["WarningDocument"][];
             road: string | null;
-            site: components["schemas"]["SiteDocument"];
+            site: components["schemas"]["Site-Output"];
             /** @enum {string} */
             status: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             /** Format: date-time */
@@ -4587,7 +4648,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
-            layout: components["schemas"]["TagPlaceDocument"] | components["schemas"]["LinePlaceDocument"];
+            layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             measure_m: number | null;
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
@@ -4602,20 +4663,28 @@ export interface components {
         MagnetIn: {
             /** @constant */
             family: "magnet";
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
             lane: components["schemas"]["LaneIn"];
+            /** @default null */
             line?: components["schemas"]["LineIn"] | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
-            site?: components["schemas"]["SiteIn"];
+            site?: components["schemas"]["Site-Input"];
             /**
              * @default planned
              * @enum {string}
              */
             status?: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
+            /** @default null */
             tag?: components["schemas"]["TagIn"] | null;
         };
         MaintenanceItem: {
@@ -4667,22 +4736,31 @@ export interface components {
             items: (components["schemas"]["FoundPlateDocument"] | components["schemas"]["FoundMagnetDocument"] | components["schemas"]["FoundCerpmDocument"] | components["schemas"]["FoundFiducialDocument"])[];
         };
         MarkerPatch: {
+            /** @default null */
             dev_eui?: string | null;
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position?: components["schemas"]["PositionIn"];
-            radio?: components["schemas"]["RadioIn"];
+            radio?: components["schemas"]["RadioSettings-Input"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default unknown
              * @enum {string}
              */
             side?: "left" | "right" | "unknown";
-            speed_limit?: components["schemas"]["SpeedLimitIn"] | null;
+            /** @default null */
+            speed_limit?: components["schemas"]["SpeedLimit-Input"] | null;
             /**
              * @default planned
              * @enum {string}
@@ -4722,18 +4800,20 @@ export interface components {
             registered: boolean;
             status: string | null;
         };
+        Meaning: {
+            kind: components["schemas"]["MeaningKind"];
+            value: number | string;
+        };
         MeaningDocument: {
             kind: string;
             text: string;
             unit: string;
             value: number | string;
         };
-        MeaningIn: {
-            kind: string;
-            value: number | string;
-        };
+        /** @enum {string} */
+        MeaningKind: "arrow" | "stop-line-ahead" | "speed-limit-kmh" | "speed-limit-mph" | "bend-left" | "bend-right" | "notice";
         MeaningsIn: {
-            meanings: components["schemas"]["MeaningIn"][];
+            meanings: components["schemas"]["Meaning"][];
         };
         MeasuredMarkers: {
             largest_change_m: number;
@@ -4749,6 +4829,8 @@ export interface components {
             permissions: string[];
             scope: components["schemas"]["Scope"];
         };
+        /** @enum {string} */
+        Mounting: "upright" | "lying";
         MultiLineStringIn: {
             coordinates: number[][][];
             /**
@@ -4856,18 +4938,21 @@ export interface components {
             marker_id: string;
             observations: number;
         };
-        OdometerDocument: {
-            drift: number;
-            quantum_m_s: number;
-            rate_hz: number;
-        };
-        OdometerIn: {
+        "OdometerError-Input": {
             /** @default 0.001 */
             drift?: number;
             /** @default 0.01 */
             quantum_m_s?: number;
             /** @default 10 */
             rate_hz?: number;
+        };
+        "OdometerError-Output": {
+            /** @default 0.001 */
+            drift: number;
+            /** @default 0.01 */
+            quantum_m_s: number;
+            /** @default 10 */
+            rate_hz: number;
         };
         Origin: {
             lat_deg: number;
@@ -4882,6 +4967,7 @@ export interface components {
             right_px: number[][][];
         };
         PackageIn: {
+            /** @default null */
             crs?: string | null;
             /**
              * @default [
@@ -4894,6 +4980,7 @@ export interface components {
             heaters?: boolean;
             /** @default false */
             leds?: boolean;
+            /** @default null */
             scale?: number | null;
             /**
              * @default {
@@ -4905,6 +4992,7 @@ export interface components {
              *     }
              */
             title_block?: components["schemas"]["TitleBlockIn"];
+            /** @default null */
             unit?: ("m" | "ft-us" | "ft-intl") | null;
         };
         PacketReceiverIn: {
@@ -5015,7 +5103,7 @@ export interface components {
             polarity: string;
             t_s: number;
         };
-        PassFrameDocument: {
+        PassFrame: {
             ahead_m: number;
             blur_px: number;
             plate_height_px: number;
@@ -5023,7 +5111,7 @@ export interface components {
             read_probability: number;
             unit_px: number;
         };
-        PassRateDocument: {
+        PassRate: {
             condition: string;
             read_rate: number;
             will_be_read: boolean;
@@ -5183,8 +5271,11 @@ export interface components {
             items: components["schemas"]["PlanOverview"][];
         };
         PlanPatch: {
+            /** @default null */
             name?: string | null;
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             rules?: {
                 [key: string]: unknown;
             } | null;
@@ -5261,6 +5352,12 @@ export interface components {
             updated_at: string;
             version: number;
         };
+        PlateDraft: {
+            code?: components["schemas"]["CodeInput"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+        };
         PlateDraftDocument: {
             code: components["schemas"]["DraftCodeDocument"];
             colours: components["schemas"]["PlateColourDocument"][];
@@ -5269,11 +5366,6 @@ export interface components {
             position: components["schemas"]["DraftPlaceDocument"] | null;
             sheet: components["schemas"]["PlateSheetDocument"];
             units: string[];
-        };
-        PlateDraftIn: {
-            code?: components["schemas"]["CodeIn"];
-            geometry?: components["schemas"]["GeometryIn"];
-            position?: components["schemas"]["PositionIn"] | null;
         };
         PlateGeometryDocument: {
             gap_mm: number;
@@ -5293,20 +5385,27 @@ export interface components {
             unused_correction: number;
         };
         PlateIn: {
-            code?: components["schemas"]["CodeIn"];
+            code?: components["schemas"]["CodeInput"];
             /**
              * @default plate
              * @constant
              */
             family?: "plate";
             geometry?: components["schemas"]["GeometryIn"];
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position: components["schemas"]["PositionIn"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default planned
@@ -5345,6 +5444,8 @@ export interface components {
             scheme: string | null;
             width_px: number;
         };
+        /** @enum {string} */
+        PlateScheme: "position" | "position-check" | "position-robust" | "id";
         PlateSheetDocument: {
             height_mm: number;
             width_mm: number;
@@ -5405,21 +5506,37 @@ export interface components {
             vertical_rmse_m: number | null;
         };
         PositionIn: {
+            /** @default null */
             check_points?: number | null;
+            /** @default null */
             crs?: string | null;
+            /** @default null */
             easting_m?: number | null;
+            /** @default null */
             epoch?: number | null;
+            /** @default null */
             height_m?: number | null;
+            /** @default null */
             horizontal_rmse_m?: number | null;
+            /** @default null */
             instrument?: string | null;
+            /** @default null */
             lat_deg?: number | null;
+            /** @default null */
             lon_deg?: number | null;
+            /** @default null */
             northing_m?: number | null;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             survey_file_sha256?: string | null;
+            /** @default null */
             survey_method?: string | null;
+            /** @default null */
             surveyor?: string | null;
+            /** @default null */
             vertical_datum?: string | null;
+            /** @default null */
             vertical_rmse_m?: number | null;
         };
         PositionsIn: {
@@ -5445,6 +5562,7 @@ export interface components {
         PreviewIn: {
             /** @default 3.4 */
             deceleration_m_s2?: number;
+            /** @default null */
             distance_m?: number | null;
             /** @default 2.5 */
             reaction_s?: number;
@@ -5453,11 +5571,8 @@ export interface components {
             /** @default 1 */
             check_digits?: number;
             digits: string;
-            /**
-             * @default id
-             * @enum {string}
-             */
-            scheme?: "id" | "position-robust" | "position-check" | "position";
+            /** @default id */
+            scheme?: components["schemas"]["PlateScheme"];
         };
         PrintedPlateDocument: {
             digits: string;
@@ -5476,12 +5591,13 @@ export interface components {
             letter: string;
             limited_by: string[];
             notes: string[];
-            parameters: components["schemas"]["PrintParameterDocument"][];
+            parameters: components["schemas"]["PrintParameter"][];
             photo: components["schemas"]["PrintPhotoDocument"];
             plate: components["schemas"]["PrintedPlateDocument"];
-            prediction: components["schemas"]["PrintPredictionDocument"];
+            prediction: components["schemas"]["PrintPrediction"];
             reading: components["schemas"]["PrintReadingDocument"];
             units: components["schemas"]["PrintGridDocument"];
+            view: components["schemas"]["PrintView"];
         };
         /** @enum {string} */
         PrintGradeFormat: "json" | "pdf";
@@ -5500,31 +5616,29 @@ export interface components {
             reflectance_margin: (number | null)[][];
             wrong: boolean[][];
         };
-        PrintParameterDocument: {
-            column: number | null;
+        PrintParameter: {
             cure: string | null;
             finding: string;
             grade: number;
             letter: string;
-            name: string;
-            row: number | null;
-            thresholds: components["schemas"]["ThresholdsDocument"];
+            name: components["schemas"]["PrintParameterName"];
+            thresholds: components["schemas"]["PrintThresholds"];
             unit: string;
+            unit_at: [
+                number,
+                number
+            ] | null;
             value: number;
         };
+        /** @enum {string} */
+        PrintParameterName: "symbol-contrast" | "modulation" | "reflectance-margin" | "axial-nonuniformity" | "grid-nonuniformity" | "print-growth" | "colour" | "damage" | "unused-error-correction" | "decode";
         PrintPhotoDocument: {
-            edge_mm: number;
-            focal_length_source: string;
             height_px: number;
-            light_ratio: number;
             sha256: string;
-            side_px: number;
             taken_at: string | null;
-            tilt_deg: number;
-            white_level: number;
             width_px: number;
         };
-        PrintPredictionDocument: {
+        PrintPrediction: {
             basis: string;
             camera: string;
             condition: string;
@@ -5542,6 +5656,26 @@ export interface components {
         PrintReadingDocument: {
             digits: string | null;
             outcome: string;
+        };
+        PrintThresholds: {
+            higher_is_better: boolean;
+            limits: [
+                number,
+                number,
+                number,
+                number
+            ];
+            source: string;
+            unit: string;
+        };
+        PrintView: {
+            edge_mm: number;
+            /** @enum {string} */
+            focal_length_source: "exif" | "assumed";
+            light_ratio: number;
+            side_px: number;
+            tilt_deg: number;
+            white_level: number;
         };
         Problem: {
             cure?: string;
@@ -5573,16 +5707,25 @@ export interface components {
             value: number | string | null;
         };
         ProfileIn: {
+            /** @default null */
             camera?: components["schemas"]["VehicleCameraIn"] | null;
+            /** @default null */
             frames?: components["schemas"]["FramesIn"] | null;
+            /** @default null */
             packets?: components["schemas"]["PacketsIn"] | null;
+            /** @default null */
             thermal?: boolean | null;
+            /** @default null */
             thermal_range?: number[] | null;
+            /** @default null */
             trace?: components["schemas"]["TraceIn"] | null;
         };
         ProgramsIn: {
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             marker_ids?: string[] | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
             /** @default false */
             with_keys?: boolean;
@@ -5600,6 +5743,7 @@ export interface components {
             wrong: components["schemas"]["WrongReadingDocument"][];
         };
         ProofIn: {
+            /** @default null */
             cameras?: string[] | null;
             /** @default 0.16 */
             clearance_m?: number;
@@ -5687,35 +5831,20 @@ export interface components {
             battery?: components["schemas"]["BatteryIn"];
             /** @default 13.4 */
             design_speed_m_s?: number;
+            /** @default null */
             markers?: components["schemas"]["PlacedMarkersIn"] | null;
             /** @default 365 */
             min_battery_days?: number;
             /** @default 0.99 */
             min_probability?: number;
             preview?: components["schemas"]["PreviewIn"];
-            radio?: components["schemas"]["RadioIn"];
+            radio?: components["schemas"]["RadioSettings-Input"];
             receiver?: components["schemas"]["ReceiverIn"];
             /** @default false */
             recommend?: boolean;
             /** @default US915 */
             region?: components["schemas"]["Region"];
             road?: components["schemas"]["EvenRoadIn"];
-        };
-        RadioDocument: {
-            antenna_gain_dbi: number;
-            bandwidth_hz: number;
-            channels: number;
-            coding_rate: number;
-            crc: boolean;
-            explicit_header: boolean;
-            frequency_hz: number;
-            hopping: boolean;
-            interval_s: number;
-            jitter_share: number;
-            lorawan: boolean;
-            power_dbm: number;
-            preamble_symbols: number;
-            spreading_factor: number;
         };
         RadioFindingDocument: {
             figure: number;
@@ -5728,7 +5857,7 @@ export interface components {
             unit: string;
             verdict: string;
         };
-        RadioIn: {
+        "RadioSettings-Input": {
             /** @default 2.15 */
             antenna_gain_dbi?: number;
             /** @default 500000 */
@@ -5758,20 +5887,34 @@ export interface components {
             /** @default 7 */
             spreading_factor?: number;
         };
-        RadioSettingsDocument: {
+        "RadioSettings-Output": {
+            /** @default 2.15 */
             antenna_gain_dbi: number;
+            /** @default 500000 */
             bandwidth_hz: number;
+            /** @default 1 */
             channels: number;
+            /** @default 5 */
             coding_rate: number;
+            /** @default true */
             crc: boolean;
+            /** @default true */
             explicit_header: boolean;
+            /** @default 915000000 */
             frequency_hz: number;
+            /** @default false */
             hopping: boolean;
+            /** @default 1.6 */
             interval_s: number;
+            /** @default 0.2 */
             jitter_share: number;
+            /** @default false */
             lorawan: boolean;
+            /** @default 20 */
             power_dbm: number;
+            /** @default 8 */
             preamble_symbols: number;
+            /** @default 7 */
             spreading_factor: number;
         };
         ReadGeometryDocument: {
@@ -5829,6 +5972,7 @@ export interface components {
             capture_db?: number | null;
             /** @default 1 */
             channels?: number;
+            /** @default null */
             sensitivity_dbm?: number | null;
         };
         ReceiverPositions: {
@@ -5839,7 +5983,7 @@ export interface components {
         };
         RecommendationDocument: {
             battery_days: number;
-            radio: components["schemas"]["RadioSettingsDocument"] | null;
+            radio: components["schemas"]["RadioSettings-Output"] | null;
             reaches: boolean;
             read_probability: number;
             receiver_channels: number;
@@ -5943,12 +6087,19 @@ export interface components {
             who: string;
         };
         ReprocessingIn: {
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             decoder?: string | null;
+            /** @default null */
             kinds?: components["schemas"]["DecodeKind"][] | null;
+            /** @default null */
             older_than?: string | null;
+            /** @default null */
             since?: string | null;
+            /** @default null */
             until?: string | null;
+            /** @default null */
             vehicle_id?: string | null;
         };
         ReprocessingLinks: {
@@ -6009,15 +6160,19 @@ export interface components {
         };
         RoadIn: {
             calibration?: components["schemas"]["StationIn"][];
+            /** @default null */
             crs?: string | null;
             /** @default false */
             dry_run?: boolean;
+            /** @default null */
             epoch?: number | null;
             geometry: components["schemas"]["GeoLineIn"] | components["schemas"]["MultiLineStringIn"];
             /** @default true */
             measure_markers?: boolean;
             name: string;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             reason?: string | null;
         };
         RoadLanes: {
@@ -6059,15 +6214,21 @@ export interface components {
             items: components["schemas"]["RoadSummary"][];
         };
         RoadPatch: {
+            /** @default null */
             calibration?: components["schemas"]["StationIn"][] | null;
+            /** @default null */
             crs?: string | null;
             /** @default false */
             dry_run?: boolean;
+            /** @default null */
             epoch?: number | null;
+            /** @default null */
             geometry?: (components["schemas"]["GeoLineIn"] | components["schemas"]["MultiLineStringIn"]) | null;
             /** @default true */
             measure_markers?: boolean;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             reason?: string | null;
         };
         RoadPlaced: {
@@ -6120,6 +6281,7 @@ export interface components {
             items: components["schemas"]["RoadVersionDocument"][];
         };
         RotationIn: {
+            /** @default null */
             expires_at?: string | null;
             /** @default 86400 */
             overlap_s?: number;
@@ -6127,27 +6289,6 @@ export interface components {
         RssiProfile: {
             distance_m: number[];
             rssi_dbm: number[];
-        };
-        RulesDocument: {
-            clearance_m: number;
-            confusion: number;
-            odometer: components["schemas"]["OdometerDocument"];
-            speed_m_s: number;
-            survive_missing: boolean;
-            wrong_way_safe: boolean;
-        };
-        RulesIn: {
-            /** @default 0.3 */
-            clearance_m?: number;
-            /** @default 0.001 */
-            confusion?: number;
-            odometer?: components["schemas"]["OdometerIn"];
-            /** @default 13.4 */
-            speed_m_s?: number;
-            /** @default false */
-            survive_missing?: boolean;
-            /** @default false */
-            wrong_way_safe?: boolean;
         };
         RulesTextIn: {
             text: string;
@@ -6168,17 +6309,29 @@ export interface components {
         /** @enum {string} */
         Scope: "admin" | "planner" | "surveyor" | "viewer" | "vehicle" | "operator";
         SearchIn: {
+            /** @default null */
             along?: components["schemas"]["AlongIn"] | null;
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             code?: string | null;
+            /** @default null */
             family?: ("plate" | "magnet" | "cerpm" | "fiducial") | null;
+            /** @default null */
             from_m?: number | null;
+            /** @default null */
             near?: components["schemas"]["PlaceIn"] | null;
+            /** @default null */
             nearest?: number | null;
+            /** @default null */
             polygon?: (components["schemas"]["PolygonIn"] | components["schemas"]["MultiPolygonIn"]) | null;
+            /** @default null */
             radius_m?: number | null;
+            /** @default null */
             road?: string | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
+            /** @default null */
             to_m?: number | null;
         };
         Section: {
@@ -6250,22 +6403,16 @@ export interface components {
             scopes: string;
             token_url: string;
         };
-        SiteDocument: {
-            deceleration_m_s2: number;
-            design_speed_m_s: number | null;
-            reaction_s: number;
-            readable_clearance_m: number;
-            stop_line_chainage_m: number | null;
-            vehicles: string[];
-        };
-        SiteIn: {
+        "Site-Input": {
             /** @default 3.4 */
             deceleration_m_s2?: number;
+            /** @default null */
             design_speed_m_s?: number | null;
             /** @default 2.5 */
             reaction_s?: number;
             /** @default 0.3 */
             readable_clearance_m?: number;
+            /** @default null */
             stop_line_chainage_m?: number | null;
             /**
              * @default [
@@ -6275,18 +6422,37 @@ export interface components {
              */
             vehicles?: string[];
         };
+        "Site-Output": {
+            /** @default 3.4 */
+            deceleration_m_s2: number;
+            /** @default null */
+            design_speed_m_s: number | null;
+            /** @default 2.5 */
+            reaction_s: number;
+            /** @default 0.3 */
+            readable_clearance_m: number;
+            /** @default null */
+            stop_line_chainage_m: number | null;
+            /**
+             * @default [
+             *       "sedan",
+             *       "utility"
+             *     ]
+             */
+            vehicles: string[];
+        };
         SpatialExtent: {
             bbox: number[][];
             crs: string;
         };
-        SpeedLimitDocument: {
-            /** @enum {string} */
-            unit: "km/h" | "mph";
-            value: number;
-        };
-        SpeedLimitIn: {
+        "SpeedLimit-Input": {
             /** @default km/h */
             unit?: components["schemas"]["SpeedUnit"];
+            value: number;
+        };
+        "SpeedLimit-Output": {
+            /** @default km/h */
+            unit: components["schemas"]["SpeedUnit"];
             value: number;
         };
         /** @enum {string} */
@@ -6299,12 +6465,16 @@ export interface components {
             vertex: number | null;
         };
         StationIn: {
+            /** @default null */
             ahead_m?: number | null;
+            /** @default null */
             chainage_m?: number | null;
             measure_m: number;
             /** @default 0 */
             part?: number;
+            /** @default null */
             position?: number[] | null;
+            /** @default null */
             vertex?: number | null;
         };
         SteeringDocument: {
@@ -6341,6 +6511,20 @@ export interface components {
             row: number;
             /** @enum {string} */
             state: "good" | "warning" | "refused" | "left-out";
+        };
+        "TagDesign-Input": {
+            length_m: number;
+            magnets: number;
+            /** @default 0.5 */
+            min_gap_m?: number;
+            segment_m: number;
+        };
+        "TagDesign-Output": {
+            length_m: number;
+            magnets: number;
+            /** @default 0.5 */
+            min_gap_m: number;
+            segment_m: number;
         };
         TagDocument: {
             confidence: number;
@@ -6388,9 +6572,12 @@ export interface components {
         };
         TagIn: {
             chainage_m: number;
+            /** @default null */
             code?: string | null;
+            /** @default null */
             codebook_id?: string | null;
-            meaning?: components["schemas"]["MeaningIn"] | null;
+            /** @default null */
+            meaning?: components["schemas"]["Meaning"] | null;
             /** @default 0 */
             offset_m?: number;
         };
@@ -6404,20 +6591,13 @@ export interface components {
             registered: boolean;
             status: string | null;
         };
-        TagPlaceDocument: {
+        TagPlace: {
             chainage_m: number;
+            /** @default 0 */
             offset_m: number;
         };
         TemporalExtent: {
             interval: (string | null)[][];
-        };
-        ThresholdsDocument: {
-            A: number;
-            B: number;
-            C: number;
-            D: number;
-            higher_is_better: boolean;
-            source: string;
         };
         TileMatrix: {
             cellSize: number;
@@ -6624,19 +6804,26 @@ export interface components {
         VehicleCameraIn: {
             /** @default 0 */
             azimuth_deg?: number;
+            /** @default null */
             calibration_id?: string | null;
+            /** @default null */
             cx_px?: number | null;
+            /** @default null */
             cy_px?: number | null;
             /** @default 23 */
             depression_deg?: number;
             distortion?: number[];
             /** @default 0 */
             forward_m?: number;
+            /** @default null */
             fx_px?: number | null;
+            /** @default null */
             fy_px?: number | null;
             /** @default 1.57 */
             height_m?: number;
+            /** @default null */
             height_px?: number | null;
+            /** @default null */
             horizontal_fov_deg?: number | null;
             /** @default 0 */
             left_m?: number;
@@ -6644,6 +6831,7 @@ export interface components {
             readout_s?: number;
             /** @default 0 */
             roll_deg?: number;
+            /** @default null */
             width_px?: number | null;
         };
         VehicleDocument: {
@@ -6667,6 +6855,7 @@ export interface components {
         };
         VehicleIn: {
             name: string;
+            /** @default null */
             note?: string | null;
             profile?: components["schemas"]["ProfileIn"];
         };
@@ -6684,8 +6873,10 @@ export interface components {
         VehiclePatch: {
             /** @default  */
             name?: string;
+            /** @default null */
             note?: string | null;
             profile?: components["schemas"]["ProfileIn"];
+            /** @default null */
             reason?: string | null;
             /**
              * @default active
@@ -10505,7 +10696,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["PlateDraftIn"];
+                "application/json": components["schemas"]["PlateDraft"];
             };
         };
         responses: {
@@ -10531,7 +10722,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["DraftArtworkIn"];
+                "application/json": components["schemas"]["DraftToDraw"];
             };
         };
         responses: {
@@ -10559,7 +10750,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["CameraPassIn"];
+                "application/json": components["schemas"]["DraftToPass"];
             };
         };
         responses: {
@@ -10569,7 +10760,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["CameraPassDocument"];
+                    "application/json": components["schemas"]["CameraPass"];
                 };
             };
         };
@@ -10583,7 +10774,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["CameraViewIn"];
+                "application/json": components["schemas"]["DraftToView"];
             };
         };
         responses: {
