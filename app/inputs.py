@@ -13,10 +13,14 @@ from app.errors import InvalidParameter, WaymarkError
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-class StrictModel(BaseModel):
-    """Base of every part of a request: members that it does not know are refused."""
+INPUT = ConfigDict(extra="forbid", json_schema_serialization_defaults_required=True)
+"""Of every part of a request: members that it does not know are refused. A response has all members."""
 
-    model_config = ConfigDict(extra="forbid")
+
+class StrictModel(BaseModel):
+    """Base of every part of a request."""
+
+    model_config = INPUT
 
 
 class Declaration(StrictModel):

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import asdict
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import sqlalchemy as sa
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 from typing_extensions import TypedDict
 
-from app.errors import CodeTaken, InvalidParameter, naming
+from app.errors import CodeTaken, InvalidParameter
 from app.families.documents import (
     FamilyChange,
-    Flag,
     Headed,
     MarkerDocument,
     MarkerIn,
-    Number,
     PositionIn,
-    StrictModel,
-    Whole,
     marker_head,
     marker_place,
     place_input,
@@ -33,7 +28,6 @@ from app.families.surveys import (
     Commitment,
     Flags,
     MarkerRules,
-    NewMarker,
     PlannedRow,
     RowCodes,
     Rows,
@@ -46,7 +40,7 @@ from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import PlacedPosition
-from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, MAX_SPEED_LIMIT, CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
+from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedCerpm, PlannedMarker
 from app.radio.settings import RadioSettings
@@ -58,11 +52,6 @@ from app.registry.marker_rows import CodeRow, MarkerRow, markers
 from app.surveys.georeference import GeoreferencedSurvey
 
 # === The row of a CERPM as values of the core: what it sends, its side, its speed limit and its radio.
-
-
-def speed_limit_document(limit: SpeedLimit | None) -> dict[str, Any] | None:
-    """A speed limit as it is stored."""
-    return None if limit is None else {"value": limit.value, "unit": limit.unit.value}
 
 
 def speed_limit_of(row: MarkerRow) -> SpeedLimit | None:
@@ -101,61 +90,11 @@ def message_of(row: MarkerRow, sequence: int = 0) -> CerpmMessage:
     )
 
 
-# === A CERPM that is to be registered, as its use case knows it.
-
-
-@dataclass(frozen=True, slots=True)
-class NewCerpm(NewMarker):
-    """A CERPM to register."""
-
-    family: ClassVar[str] = "cerpm"
-    position: PositionIn
-    number: int | None = None
-    side: LaneSide = LaneSide.UNKNOWN
-    speed_limit: SpeedLimit | None = None
-    dev_eui: str | None = None
-    radio: RadioSettings = field(default_factory=RadioSettings)
-    heading_deg: float | None = None
-
-
 # === Schemas of requests that register or change CERPMs.
 
 
 Side = Literal["left", "right", "unknown"]
-DevEui = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{16}$")]
-
-
-class SpeedLimitIn(StrictModel):
-    """A speed limit as it is posted."""
-
-    value: Annotated[int, Field(strict=True, ge=1, le=MAX_SPEED_LIMIT)]
-    unit: SpeedUnit = SpeedUnit.KM_H
-
-
-class RadioIn(StrictModel):
-    """How the marker's radio is set."""
-
-    frequency_hz: Whole = Field(915_000_000, description="Carrier, or the first of several. [Hz]")
-    spreading_factor: Whole = Field(7, description="7 to 12, or 6 without a header.")
-    bandwidth_hz: Whole = Field(500_000, description="125000, 250000 or 500000. [Hz]")
-    interval_s: Number = Field(1.6, description="From one transmission to the next on average. [s]")
-    jitter_share: Number = Field(0.2, description="Each interval is drawn evenly around that, this share to each side.")
-    power_dbm: Number = Field(
-        20.0, description="At the antenna's connector, -4 to 20; above 17 it may send 1 % of the time. [dBm]"
-    )
-    antenna_gain_dbi: Number = Field(2.15, description="-10 to 6. [dBi]")
-    channels: Whole = Field(1, description="Over which packets are spread, 1 to 128.")
-    hopping: Flag = Field(False, description="Every marker uses all channels in turn; else each has one.")
-    coding_rate: Whole = Field(5, description="5 to 8: 4/5 to 4/8.")
-    preamble_symbols: Whole = Field(8, description="Length of the preamble.")
-    explicit_header: Flag = Field(True, description="Whether packets have a header.")
-    crc: Flag = Field(True, description="Whether packets have a checksum of the radio.")
-    lorawan: Flag = Field(False, description="The message travels in a LoRaWAN frame.")
-
-    def settings(self) -> RadioSettings:
-        """The radio as the encoders know it."""
-        with naming("radio"):
-            return RadioSettings(**self.model_dump())
+DevEui = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{16}$"), AfterValidator(str.lower)]
 
 
 CERPM_EXAMPLES: list[JsonValue] = [
@@ -191,42 +130,20 @@ class CerpmIn(Headed, MarkerIn):
         None, description="Within the agency; the next free one if left out."
     )
     side: Side = Field("unknown", description="Boundary of the lane that it is on, in the direction of travel.")
-    speed_limit: SpeedLimitIn | None = Field(None, description="As it is posted; nothing where none is.")
+    speed_limit: SpeedLimit | None = Field(None, description="As it is posted; nothing where none is.")
     dev_eui: DevEui | None = Field(None, description="LoRaWAN DevEUI, where the marker joins a network.")
-    radio: RadioIn = Field(default_factory=lambda: RadioIn())
-
-    def new(self) -> NewCerpm:
-        """The marker as the use cases know it."""
-        return NewCerpm(
-            position=self.position,
-            number=self.number,
-            side=LaneSide[self.side.upper()],
-            speed_limit=SpeedLimit(self.speed_limit.value, self.speed_limit.unit) if self.speed_limit else None,
-            radio=self.radio.settings(),
-            dev_eui=self.dev_eui.lower() if self.dev_eui is not None else None,
-            heading_deg=self.heading_deg,
-            **self.shared(),
-        )
+    radio: RadioSettings = Field(default_factory=RadioSettings)
 
 
 class CerpmChange(FamilyChange):
     """Members of a change that CERPMs have."""
 
     side: Side = Field("unknown", description="Of a CERPM.")
-    speed_limit: SpeedLimitIn | None = Field(None, description="Of a CERPM.")
+    speed_limit: SpeedLimit | None = Field(None, description="Of a CERPM.")
     dev_eui: DevEui | None = Field(None, description="Of a CERPM.")
-    radio: RadioIn = Field(default_factory=lambda: RadioIn(), description="Of a CERPM; replaces the whole of the old.")
-
-    def spec_changes(self, named: set[str]) -> dict[str, Any]:
-        """Side, speed limit, DevEUI and radio where the request names them."""
-        limit = self.speed_limit
-        spec: dict[str, Any] = {
-            "side": self.side,
-            "speed_limit": None if limit is None else limit.model_dump(mode="json"),
-            "dev_eui": self.dev_eui.lower() if self.dev_eui is not None else None,
-        }
-        spec = {name: value for name, value in spec.items() if name in named}
-        return {**spec, "radio": asdict(self.radio.settings())} if "radio" in named else spec
+    radio: RadioSettings = Field(
+        default_factory=RadioSettings, description="Of a CERPM; replaces the whole of the old."
+    )
 
 
 # === CERPMs as clients see them.
@@ -240,51 +157,20 @@ class CerpmCodeDocument(TypedDict):
     number: int
 
 
-class SpeedLimitDocument(TypedDict):
-    """A posted speed limit."""
-
-    value: int
-    unit: Literal["km/h", "mph"]
-
-
-class RadioDocument(TypedDict):
-    """Settings of a CERPM's radio."""
-
-    frequency_hz: int
-    spreading_factor: int
-    bandwidth_hz: int
-    interval_s: float
-    jitter_share: float
-    power_dbm: float
-    antenna_gain_dbi: float
-    channels: int
-    hopping: bool
-    coding_rate: int
-    preamble_symbols: int
-    explicit_header: bool
-    crc: bool
-    lorawan: bool
-
-
-class CerpmSpec(TypedDict):
-    """What the row of a CERPM has in its column `spec`."""
-
-    side: Literal["left", "right", "unknown"]
-    speed_limit: SpeedLimitDocument | None
-    dev_eui: str | None
-    radio: RadioDocument
-
-
-class CerpmDocument(MarkerDocument, CerpmSpec):
+class CerpmDocument(MarkerDocument):
     """A CERPM."""
 
     family: Literal["cerpm"]
     code: CerpmCodeDocument
+    side: Side
+    speed_limit: SpeedLimit | None
+    dev_eui: str | None
+    radio: RadioSettings
 
 
 def cerpm_document(row: MarkerRow) -> CerpmDocument:
     """A CERPM's row as clients see it."""
-    spec: CerpmSpec = row.spec
+    spec = row.spec
     return {
         **marker_head(row),
         "family": "cerpm",
@@ -303,30 +189,18 @@ def cerpm_document(row: MarkerRow) -> CerpmDocument:
 class CerpmSurveyIn(BaseModel):
     """Members of a survey's declaration that CERPMs have."""
 
-    side: Literal["unknown", "left", "right"] = Field("unknown", description="Of CERPMs without one of their own.")
-    speed_limit: SpeedLimitIn | None = Field(None, description="Of CERPMs.")
+    side: Side = Field("unknown", description="Of CERPMs without one of their own.")
+    speed_limit: SpeedLimit | None = Field(None, description="Of CERPMs.")
 
 
-@dataclass(frozen=True, slots=True)
-class CerpmDefaults:
-    """What a survey's CERPMs have in common."""
-
-    side: LaneSide = LaneSide.UNKNOWN
-    speed_limit: SpeedLimit | None = None
-
-
-class CerpmSurvey(SurveyImport[CerpmDefaults]):
+class CerpmSurvey(SurveyImport[CerpmSurveyIn]):
     """Points that become CERPMs: rows without a number get the next ones of the agency."""
 
     members = CerpmSurveyIn
 
-    def defaults(self, declared: Mapping[str, Any]) -> CerpmDefaults:
+    def defaults(self, declared: Mapping[str, Any]) -> CerpmSurveyIn:
         """Side and speed limit."""
-        limit = declared.get("speed_limit")
-        return CerpmDefaults(
-            LaneSide[str(declared.get("side", "unknown")).upper()],
-            SpeedLimit(limit["value"], SpeedUnit(limit["unit"])) if limit is not None else None,
-        )
+        return CerpmSurveyIn.model_validate(declared)
 
     def check_values(
         self, survey: GeoreferencedSurvey, wanted: Flags, declaration: ImportDeclaration
@@ -343,12 +217,12 @@ class CerpmSurvey(SurveyImport[CerpmDefaults]):
             message = f"height_m is {height[row]:g}, a message holds {HEIGHT_M[0]:g} to {HEIGHT_M[1]:g} m"
             yield Fault(int(row) + 1, "position.height_m", "not_a_marker", message, cure)
 
-    def code_form(self, defaults: CerpmDefaults, *, compare: bool) -> CodeForm:
+    def code_form(self, defaults: CerpmSurveyIn, *, compare: bool) -> CodeForm:
         """Numbers."""
         return CodeForm("[1-9][0-9]{0,9}", True, "numbers of CERPMs")
 
     def read_codes(
-        self, survey: GeoreferencedSurvey, rows: Rows, defaults: CerpmDefaults
+        self, survey: GeoreferencedSurvey, rows: Rows, defaults: CerpmSurveyIn
     ) -> tuple[RowCodes, list[Fault]]:
         """Numbers."""
         return _read_numbers(survey, rows)
@@ -375,7 +249,7 @@ class CerpmSurvey(SurveyImport[CerpmDefaults]):
     def collides(
         self,
         codes: RowCodes,
-        defaults: CerpmDefaults,
+        defaults: CerpmSurveyIn,
         place: tuple[float, float],
         known: CodeRow,
         agency_id: str,
@@ -384,15 +258,15 @@ class CerpmSurvey(SurveyImport[CerpmDefaults]):
         """Only with CERPMs of the same agency."""
         return known.agency_id == agency_id
 
-    def columns(self, survey: GeoreferencedSurvey, codes: RowCodes, defaults: CerpmDefaults) -> Columns:
+    def columns(self, survey: GeoreferencedSurvey, codes: RowCodes, defaults: CerpmSurveyIn) -> Columns:
         """The spec, by the side of the row."""
         specs = _specs(defaults)
         same: dict[str, Any] = {"scheme": codes.scheme}
         own: dict[str, Sequence[Any]] = {}
         if "side" in survey.table.texts:
-            own["spec"] = [specs[side.upper()] for side in texts_of(survey, codes.rows, "side")]
+            own["spec"] = [specs[side.lower() or defaults.side] for side in texts_of(survey, codes.rows, "side")]
         else:
-            same["spec"] = specs[""]
+            same["spec"] = specs[defaults.side]
         return Columns(len(codes.rows), same, own)
 
 
@@ -413,19 +287,17 @@ def _read_numbers(survey: GeoreferencedSurvey, rows: Rows) -> tuple[RowCodes, li
     return RowCodes(rows, digits, numbers > 0, "cerpm").of(good), faults
 
 
-def _specs(defaults: CerpmDefaults) -> dict[str, dict[str, Any]]:
+def _specs(defaults: CerpmSurveyIn) -> dict[str, dict[str, object]]:
     """What CERPMs of each side keep; rows share these, and none changes them."""
-    limit, radio = speed_limit_document(defaults.speed_limit), _default_radio()
-    of_side = {
-        side.name: {"side": side.name.lower(), "speed_limit": limit, "dev_eui": None, "radio": radio}
-        for side in LaneSide
-    }
-    return {**of_side, "": of_side[defaults.side.name]}
+    return {side: _spec(side, defaults.speed_limit, RadioSettings()) for side in get_args(Side)}
 
 
-@lru_cache
-def _default_radio() -> dict[str, Any]:
-    return asdict(RadioSettings())
+def _spec(
+    side: str, speed_limit: SpeedLimit | None, radio: RadioSettings, dev_eui: str | None = None
+) -> dict[str, object]:
+    """What the row of a CERPM has in its column `spec`."""
+    limit = None if speed_limit is None else {"value": speed_limit.value, "unit": speed_limit.unit.value}
+    return {"side": side, "speed_limit": limit, "dev_eui": dev_eui, "radio": asdict(radio)}
 
 
 # === The family of CERPMs: their numbers, the properties that they broadcast, and their radio.
@@ -434,7 +306,7 @@ def _default_radio() -> dict[str, Any]:
 _SPAN = ("first_sequence", "last_sequence", "first_heard_s", "last_heard_s")
 
 
-class Cerpms(Family[NewCerpm, PlacedPosition]):
+class Cerpms(Family[CerpmIn, PlacedPosition]):
     """The family of chip-enabled raised pavement markers."""
 
     name = "cerpm"
@@ -449,12 +321,12 @@ class Cerpms(Family[NewCerpm, PlacedPosition]):
     document_type = CerpmDocument
     detail_type = CerpmDocument
 
-    def prepare(self, registration: Registration, new: NewCerpm) -> PlacedPosition:
+    def prepare(self, registration: Registration, new: CerpmIn) -> PlacedPosition:
         """The marker's place in WGS 84."""
         return place_input(new.position, registration.rules.crs_accuracy_m)
 
     def columns(
-        self, connection: sa.Connection, registration: Registration, new: NewCerpm, prepared: PlacedPosition
+        self, connection: sa.Connection, registration: Registration, new: CerpmIn, prepared: PlacedPosition
     ) -> dict[str, Any]:
         """Number, place and spec.
 
@@ -481,12 +353,7 @@ class Cerpms(Family[NewCerpm, PlacedPosition]):
             "digits": str(number),
             "heading_deg": new.heading_deg,
             **position_columns(new.position, prepared),
-            "spec": {
-                "side": new.side.name.lower(),
-                "speed_limit": speed_limit_document(new.speed_limit),
-                "dev_eui": new.dev_eui,
-                "radio": asdict(new.radio),
-            },
+            "spec": _spec(new.side, new.speed_limit, new.radio, new.dev_eui),
         }
         message_of(row_of(MarkerRow, columns))
         return columns
@@ -527,23 +394,12 @@ class Cerpms(Family[NewCerpm, PlacedPosition]):
 
     def planned_rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
         """One row for each CERPM."""
-        radio = asdict(commitment.radio)
         for marker in markers:
             detail = marker.detail
             assert isinstance(detail, PlannedCerpm)
-            spec = {
-                "side": detail.side.name.lower(),
-                "speed_limit": speed_limit_document(detail.speed_limit),
-                "dev_eui": None,
-                "radio": radio,
-            }
-            columns = {
-                **commitment.position(marker),
-                "scheme": "cerpm",
-                "digits": str(detail.number),
-                "spec": spec,
-            }
-            yield PlannedRow(marker.number, columns)
+            spec = _spec(detail.side.name.lower(), detail.speed_limit, commitment.radio)
+            columns = {"scheme": "cerpm", "digits": str(detail.number), "spec": spec}
+            yield PlannedRow(marker.number, commitment.position(marker) | columns)
 
     def snapshot_columns(self) -> tuple[sa.ColumnElement[Any], ...]:
         """Side, speed limit and interval."""

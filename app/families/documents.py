@@ -9,7 +9,6 @@ from pydantic import AfterValidator, BaseModel, Field, JsonValue
 from typing_extensions import ReadOnly, TypedDict
 
 from app.errors import InvalidParameter, ReferenceSystemError
-from app.families.surveys import NewMarker
 from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
 from app.geodesy.systems import normalize_vertical_datum
@@ -198,23 +197,14 @@ class MarkerIn(PlacementIn):
     family: str
     status: Status = "planned"
 
-    def new(self) -> NewMarker:
-        """The marker as the use cases know it."""
-        raise NotImplementedError
-
-    def shared(self) -> dict[str, Any]:
-        """Members that markers of every family have, for `NewMarker`."""
-        return self.model_dump(
-            include={"status", "heading_rmse_deg", "road", "measure_m", "offset_m", "kind", "reason"}
-        )
+    @property
+    def part_count(self) -> int:
+        """Things in the road that the marker has at most, e.g. magnets: what its registration costs."""
+        return 1
 
 
 class FamilyChange(BaseModel):
     """Members of a change that only one family has; they are kept in the marker's spec."""
-
-    def spec_changes(self, named: set[str]) -> dict[str, Any]:
-        """Members of the spec that a change replaces, of those that the request names."""
-        raise NotImplementedError
 
 
 class Headed(PlacementIn):
@@ -273,8 +263,8 @@ def place_input(position: PositionIn, accuracy_m: float) -> PlacedPosition:
     )
 
 
-def position_columns(position: PositionIn, placed: PlacedPosition) -> dict[str, Any]:
-    """Columns of a marker that keep its position and where it comes from."""
+def position_columns(position: ProvenanceIn, placed: PlacedPosition) -> dict[str, Any]:
+    """Columns of a marker that keep its position, or the first one of its lane, and where it comes from."""
     return {
         "lon_deg": placed.lon_deg,
         "lat_deg": placed.lat_deg,
@@ -290,6 +280,6 @@ def position_columns(position: PositionIn, placed: PlacedPosition) -> dict[str, 
         "surveyor": position.surveyor,
         "instrument": position.instrument,
         "survey_file_sha256": position.survey_file_sha256,
-        "original": position.model_dump(exclude_none=True),
+        "original": position.model_dump(exclude_none=True, exclude={"geometry", "points_m"}),
         **grade_columns(position.horizontal_rmse_m, placed.transform_accuracy_m, placed.note),
     }

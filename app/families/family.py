@@ -20,7 +20,7 @@ from pydantic import JsonValue
 from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkOptions, Drawing, PlateReader
 from app.families.documents import FamilyChange, MarkerDocument, MarkerIn
-from app.families.surveys import Commitment, MarkerRules, NewMarker, PlannedRow, SurveyImport
+from app.families.surveys import Commitment, MarkerRules, PlannedRow, SurveyImport
 from app.markers.reading import PlatePose
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedMarker
@@ -157,7 +157,7 @@ def distance_to_row(row: MarkerRow, position: ApproximatePosition) -> float:
 # === What a family of markers declares. All other code asks the declaration; `app.families.FAMILIES` lists them.
 
 
-New = TypeVar("New", bound=NewMarker)
+New = TypeVar("New", bound=MarkerIn)
 Prepared = TypeVar("Prepared")
 
 
@@ -178,7 +178,7 @@ class Family(ABC, Generic[New, Prepared]):
     name: ClassVar[str]  # as it is stored and as clients send it
     label: ClassVar[str]  # one marker in a sentence
     title: ClassVar[str]  # the family in a heading
-    schema: ClassVar[type[MarkerIn]]  # body of a request that registers a marker
+    schema: ClassVar[type[MarkerIn]]  # a marker that is to be registered, as requests have it
     examples: ClassVar[Sequence[JsonValue]]  # bodies that the API's documentation shows
     change: ClassVar[type[FamilyChange] | None] = None  # members of a change that only this family has
     document_type: ClassVar[Any]  # shape of a marker in lists and histories

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import sqlalchemy as sa
@@ -45,7 +45,6 @@ from app.families.family import (
 from app.families.surveys import (
     RETIRED,
     MarkerRules,
-    NewMarker,
     RowCodes,
     Rows,
     SurveyImport,
@@ -65,33 +64,7 @@ from app.registry.spatial import distance_m
 from app.sensors.camera import Camera
 from app.surveys.georeference import GeoreferencedSurvey
 
-# === A fiducial sign that is to be registered, as its use case knows it.
-
-
-@dataclass(frozen=True, slots=True)
-class NewFiducial(NewMarker):
-    """A fiducial sign to register."""
-
-    family: ClassVar[str] = "fiducial"
-    position: PositionIn
-    code: FiducialCode
-    geometry: FiducialGeometry
-    heading_deg: float | None = None
-
-
 # === Schemas of requests that register fiducial signs.
-
-
-class FiducialCodeIn(StrictModel):
-    """The code of a sign."""
-
-    dictionary: Text = Field(max_length=40, description="Such as `apriltag-36h11` or `aruco-4x4-50`.")
-    number: Annotated[int, Field(strict=True, ge=0)] = Field(description="Of the codeword in the dictionary, from 0.")
-
-    def code(self) -> FiducialCode:
-        """The code as the core knows it."""
-        with naming("code"):
-            return FiducialCode(self.dictionary, self.number)
 
 
 class FiducialGeometryIn(StrictModel):
@@ -101,16 +74,17 @@ class FiducialGeometryIn(StrictModel):
     quiet_mm: Number | None = Field(
         None, description="White zone round the border; as wide as a module if left out, at most 1000. [mm]"
     )
-    mounting: Literal["upright", "lying"] = Field(
-        "upright", description="Facing the traffic, or flat on the road with its upper edge in the direction of travel."
+    mounting: Mounting = Field(
+        Mounting.UPRIGHT,
+        description="Facing the traffic, or flat on the road with its upper edge in the direction of travel.",
     )
 
-    def geometry(self, code: FiducialCode) -> FiducialGeometry:
-        """The dimensions as the core knows them."""
+    def of_code(self, code: FiducialCode) -> FiducialGeometry:
+        """The dimensions of a sign with a code, all of them."""
         module_mm = self.side_mm / (get_dictionary(code.dictionary).modules + 2)
         with naming("geometry"):
             quiet_mm = module_mm if self.quiet_mm is None else self.quiet_mm
-            return FiducialGeometry(self.side_mm, quiet_mm, Mounting(self.mounting))
+            return FiducialGeometry(self.side_mm, quiet_mm, self.mounting)
 
 
 FIDUCIAL_EXAMPLES: list[JsonValue] = [
@@ -132,19 +106,8 @@ class FiducialIn(Headed, MarkerIn):
 
     family: Literal["fiducial"]
     position: PositionIn
-    code: FiducialCodeIn
+    code: FiducialCode
     geometry: FiducialGeometryIn
-
-    def new(self) -> NewFiducial:
-        """The sign as the use cases know it."""
-        code = self.code.code()
-        return NewFiducial(
-            position=self.position,
-            code=code,
-            geometry=self.geometry.geometry(code),
-            heading_deg=self.heading_deg,
-            **self.shared(),
-        )
 
 
 # === Fiducial signs as clients see them.
@@ -159,25 +122,16 @@ class FiducialCodeDocument(TypedDict):
     number: int
 
 
-class FiducialGeometryDocument(TypedDict):
-    """Dimensions and mounting of a sign."""
-
-    side_mm: float
-    quiet_mm: float
-    mounting: Literal["upright", "lying"]
-
-
 class FiducialDocument(MarkerDocument):
     """An ArUco or AprilTag sign."""
 
     family: Literal["fiducial"]
     code: FiducialCodeDocument
-    geometry: FiducialGeometryDocument
+    geometry: FiducialGeometry
 
 
 def fiducial_document(row: MarkerRow) -> FiducialDocument:
     """A sign's row as clients see it."""
-    spec: FiducialGeometryDocument = row.spec
     return {
         **marker_head(row),
         "family": "fiducial",
@@ -187,7 +141,7 @@ def fiducial_document(row: MarkerRow) -> FiducialDocument:
             "dictionary": row.scheme,
             "number": int(row.digits.rpartition("-")[2]),
         },
-        "geometry": {"side_mm": spec["side_mm"], "quiet_mm": spec["quiet_mm"], "mounting": spec["mounting"]},
+        "geometry": row.spec,
         **marker_place(row),
     }
 
@@ -202,7 +156,7 @@ def fiducial_code(row: MarkerRow) -> FiducialCode:
 
 def fiducial_geometry(row: MarkerRow) -> FiducialGeometry:
     """Dimensions and mounting of a sign's row."""
-    spec: FiducialGeometryDocument = row.spec
+    spec = row.spec
     return FiducialGeometry(spec["side_mm"], spec["quiet_mm"], Mounting(spec["mounting"]))
 
 
@@ -319,7 +273,7 @@ class FiducialSurvey(SurveyImport[KnownFiducial | None]):
         sign = SignIn.model_validate(declared["sign"])
         with naming("sign"):
             code = FiducialCode(sign.dictionary, 0)
-            return KnownFiducial(code, sign.geometry.geometry(code))
+            return KnownFiducial(code, sign.geometry.of_code(code))
 
     def code_form(self, defaults: KnownFiducial | None, *, compare: bool) -> CodeForm:
         """Numbers, with or without the series of the dictionary."""
@@ -370,8 +324,7 @@ class FiducialSurvey(SurveyImport[KnownFiducial | None]):
 
     def columns(self, survey: GeoreferencedSurvey, codes: RowCodes, defaults: KnownFiducial | None) -> Columns:
         """Dictionary and dimensions."""
-        spec = asdict(_declared(defaults).geometry)
-        same = {"scheme": codes.scheme, "spec": {**spec, "mounting": str(spec["mounting"])}}
+        same = {"scheme": codes.scheme, "spec": asdict(_declared(defaults).geometry)}
         return Columns(len(codes.rows), same, {})
 
 
@@ -389,7 +342,7 @@ def _declared(defaults: KnownFiducial | None) -> KnownFiducial:
 # === The family of fiducial signs: ArUco and AprilTag signs that agencies have in use.
 
 
-class Fiducials(Family[NewFiducial, PlacedPosition]):
+class Fiducials(Family[FiducialIn, PlacedPosition]):
     """The family of fiducial signs."""
 
     name = "fiducial"
@@ -403,12 +356,12 @@ class Fiducials(Family[NewFiducial, PlacedPosition]):
     document_type = FiducialDocument
     detail_type = FiducialDocument
 
-    def prepare(self, registration: Registration, new: NewFiducial) -> PlacedPosition:
+    def prepare(self, registration: Registration, new: FiducialIn) -> PlacedPosition:
         """The sign's place in WGS 84."""
         return place_input(new.position, registration.rules.crs_accuracy_m)
 
     def columns(
-        self, connection: sa.Connection, registration: Registration, new: NewFiducial, prepared: PlacedPosition
+        self, connection: sa.Connection, registration: Registration, new: FiducialIn, prepared: PlacedPosition
     ) -> dict[str, Any]:
         """Code, dimensions and place.
 
@@ -418,17 +371,12 @@ class Fiducials(Family[NewFiducial, PlacedPosition]):
             Another sign nearby carries the code.
         """
         _check_free(connection, registration, new.code.text, prepared.lon_deg, prepared.lat_deg)
-        geometry = new.geometry
         return {
             "family": self.name,
             "scheme": new.code.dictionary,
             "digits": new.code.text,
             "heading_deg": new.heading_deg,
-            "spec": {
-                "side_mm": geometry.side_mm,
-                "quiet_mm": geometry.quiet_mm,
-                "mounting": str(geometry.mounting),
-            },
+            "spec": asdict(new.geometry.of_code(new.code)),
             **position_columns(new.position, prepared),
         }
 

@@ -47,29 +47,6 @@ def is_placed_again(row: MarkerRow, values: dict[str, Any]) -> bool:
     return "lon_deg" in values or (row.status == RETIRED and values.get("status", RETIRED) != RETIRED)
 
 
-# === A marker that is to be registered: what every family asks for.
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NewMarker:
-    """Members that markers of every family have; each family adds its own."""
-
-    family: ClassVar[str]  # name of the family
-    status: str = PLANNED
-    heading_rmse_deg: float | None = None
-    road: str | None = None
-    measure_m: float | None = None
-    offset_m: float | None = None
-    # `kind`, `reason`: kind of the first version in the marker's history, and why it was made
-    kind: str | None = None
-    reason: str | None = None
-
-    @property
-    def part_count(self) -> int:
-        """Things in the road that the marker has at most, e.g. magnets: what its registration costs."""
-        return 1
-
-
 # === How the markers of a plan become rows of the registry, thousands at a time.
 
 

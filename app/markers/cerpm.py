@@ -22,13 +22,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
+from typing import Annotated
 
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.cmac import CMAC
 from cryptography.hazmat.primitives.kdf.kbkdf import KBKDFCMAC, CounterLocation, Mode
+from pydantic import Field, with_config
 
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
+from app.inputs import INPUT
 
 VERSION = 1
 MESSAGE_BYTES = 24  # [bytes] source: the longest packet of SF10 at 125 kHz within the 400 ms of 47 CFR 15.247
@@ -64,11 +67,12 @@ class SpeedUnit(StrEnum):
         return 1.0 if self is SpeedUnit.KM_H else 1.609344
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class SpeedLimit:
     """A speed limit as it is posted."""
 
-    value: int
+    value: Annotated[int, Field(strict=True, ge=1, le=MAX_SPEED_LIMIT)]
     unit: SpeedUnit = SpeedUnit.KM_H
 
     def __post_init__(self) -> None:

@@ -13,12 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
+from typing import Annotated
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, with_config
 
 from app.errors import CodeMismatch, InvalidParameter
+from app.inputs import INPUT, Text
 
 SIDE_MM = (30.0, 3000.0)
 """Of the black border's outer edge. [mm]"""
@@ -84,22 +87,16 @@ def codewords(name: str) -> npt.NDArray[np.uint8]:
     return words
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class FiducialCode:
-    """A codeword of a dictionary.
+    """The code of a sign: a codeword of a dictionary."""
 
-    Raises
-    ------
-    InvalidParameter
-        There is no such dictionary.
-    CodeMismatch
-        The dictionary has fewer codewords.
-    """
-
-    dictionary: str  # name of the dictionary
-    number: int  # of the codeword, from 0
+    dictionary: Annotated[Text, Field(max_length=40, description="Such as `apriltag-36h11` or `aruco-4x4-50`.")]
+    number: Annotated[int, Field(strict=True, ge=0, description="Of the codeword in the dictionary, from 0.")]
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if there is no such dictionary, CodeMismatch if it has fewer codewords."""
         size = get_dictionary(self.dictionary).size
         if not 0 <= self.number < size:
             raise CodeMismatch(
@@ -147,21 +144,17 @@ class Mounting(StrEnum):
     LYING = "lying"
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class FiducialGeometry:
-    """Dimensions and mounting of a sign.
-
-    Raises
-    ------
-    InvalidParameter
-        A dimension is outside its limits.
-    """
+    """Dimensions and mounting of a sign."""
 
     side_mm: float  # [mm] outer edge of the black border, 30 to 3000
     quiet_mm: float  # [mm] width of the white zone round the border, 0 to 1000
     mounting: Mounting = Mounting.UPRIGHT
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if a dimension is outside its limits."""
         for name, value, (low, high) in (
             ("side_mm", self.side_mm, SIDE_MM),
             ("quiet_mm", self.quiet_mm, (0.0, MAX_QUIET_MM)),

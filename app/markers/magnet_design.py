@@ -11,13 +11,15 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import product
 from math import comb
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy
+from pydantic import Field, SkipValidation, WithJsonSchema, with_config
 
 from app.errors import CodeMismatch, Conflict, InvalidParameter
+from app.inputs import INPUT, Number, Whole
 from app.markers.magnet import (
     FIELD_UT_M3,
     MIN_GAP_M,
@@ -32,23 +34,21 @@ from app.markers.magnet import (
 )
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class TagDesign:
-    """What the tags of a family share: {M, L, Seg_d}, and how near neighbours may stand.
+    """What the tags of a codebook share: {M, L, Seg_d}, and how near neighbours may stand."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside the limits of a tag.
-    """
-
-    magnets: int  # m, 2 to 7
-    length_m: float  # [m] L, a whole number of segments
-    segment_m: float  # [m] Seg_d
-    # [m] least distance between neighbours; 0.5 m keeps their fields apart, 0 gives the paper's ideal
-    min_gap_m: float = MIN_GAP_M
+    magnets: Annotated[Whole, Field(description="M, 2 to 7.")]
+    length_m: Annotated[Number, Field(description="L, from the first magnet to the last, 0.5 to 30. [m]")]
+    segment_m: Annotated[
+        Number, Field(description="Seg_d, the grid of the middle magnets; L is a whole number of it. [m]")
+    ]
+    # 0.5 m keeps the fields of neighbours apart, 0 gives the paper's ideal
+    min_gap_m: Annotated[Number, Field(description="Least distance between neighbours, 0.5 or more. [m]")] = MIN_GAP_M
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if a value is outside the limits of a tag."""
         check_magnet_count(self.magnets)
         segments_in(self.length_m, self.segment_m)
         object.__setattr__(self, "length_m", rounded_m(self.length_m, "length_m"))
@@ -232,14 +232,17 @@ METRO_ERROR = MagnetErrorModel(channels=1.0, timing_s=1 / 350 / math.sqrt(12))
 """The paper's pipeline: peaks at whole samples of one axis (section 5.2 and equation 1)."""
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class OdometerError:
     """Errors of the vehicle's speed that do not cancel in a ratio."""
 
-    quantum_m_s: float = 0.01  # [m/s] step of the speed signal
-    rate_hz: float = 10.0  # speeds per second. [Hz] Source: METRO section 7.1.
-    # standard deviation of the relative change of scale from one gap to the next (slip, braking, latency)
-    drift: float = 0.001
+    quantum_m_s: Annotated[Number, Field(ge=0, le=5, description="Step of the speed signal. [m/s]")] = 0.01
+    rate_hz: Annotated[Number, Field(ge=0.1, le=1000, description="Speeds a second. [Hz]")] = 10.0  # METRO section 7.1
+    # standard deviation; by slip, braking, latency
+    drift: Annotated[Number, Field(ge=0, le=0.1, description="Relative change of scale from one gap to the next.")] = (
+        0.001
+    )
 
     def __post_init__(self) -> None:
         _check_fields(self, may_be_zero=("quantum_m_s", "drift"))
@@ -351,11 +354,11 @@ def separation_for(confusion: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Distinguishable:
-    """How many codes of a design can be distinguished when all are in use."""
+    """How many codes of a design are read right with the probability `accuracy` when all are in use."""
 
-    share: float  # share of the codes that are read right with the probability asked for
-    codes: int  # the same as a number of codes, of `capacity`
-    capacity: int
+    accuracy: float
+    share: float  # of the codes
+    codes: int  # the same as a number of codes
     # `mean_accuracy`, `worst_accuracy`: probability that the ratios of a code are read right, at least
     mean_accuracy: float
     worst_accuracy: float
@@ -384,11 +387,11 @@ def distinguishable(design: TagDesign, conditions: ReadingConditions, *, accurac
     if not 0 < accuracy < 1:
         raise InvalidParameter(f"accuracy is {accuracy:g}", field="accuracy", limit="between 0 and 1")
     if not design.placements:
-        return Distinguishable(0.0, 0, 0, 0.0, 0.0)
+        return Distinguishable(accuracy, 0.0, 0, 0.0, 0.0)
     right = 1.0 - np.minimum(_confusion(design, placements_of(design), conditions), 1.0)
     share = float(np.mean(right >= accuracy))
     codes = round(share * design.placements) * 2**design.magnets
-    return Distinguishable(share, codes, design.coupled_capacity, float(right.mean()), float(right.min()))
+    return Distinguishable(accuracy, share, codes, float(right.mean()), float(right.min()))
 
 
 def placements_of(design: TagDesign, max_count: int = MAX_PLACEMENTS) -> npt.NDArray[np.int64]:
@@ -463,16 +466,28 @@ _NUMBERS: dict[MeaningKind, tuple[str, float, float]] = {
 """Unit and limits of the kinds whose value is a number."""
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """The meaning of a code."""
+    """What a tag means."""
 
-    kind: MeaningKind
-    # a number in the kind's unit (distance to the stop line [m], speed limit, angle of the bend [deg]), the `Arrow`, or
-    # the text of a notice, 1 to 80 printable characters
-    value: float | str
+    kind: Annotated[
+        MeaningKind,
+        Field(
+            description="arrow, stop-line-ahead [m], speed-limit-kmh, speed-limit-mph, bend-left, bend-right [deg], "
+            "notice"
+        ),
+    ]
+    value: Annotated[
+        SkipValidation[float | str],
+        WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string", "maxLength": 80}]}),
+        Field(
+            description="A number in the kind's unit, the arrow, or the text of the notice, 1 to 80 printable characters."
+        ),
+    ]
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if the value does not belong to the kind."""
         try:
             kind = MeaningKind(self.kind)
         except ValueError as error:
@@ -500,13 +515,13 @@ class Meaning:
 def _checked_value(kind: MeaningKind, value: float | str) -> float | str:
     if kind in _NUMBERS:
         unit, low, high = _NUMBERS[kind]
-        if isinstance(value, (str, bool)) or not math.isfinite(value) or not low <= value <= high:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
             raise InvalidParameter(
-                f"the value of {kind} is {value!r}", field="value", limit=f"{low:g} to {high:g} {unit}"
+                f"the value of {kind} is {str(value)[:40]!r}", field="value", limit=f"{low:g} to {high:g} {unit}"
             )
         return float(value)
     if kind is MeaningKind.ARROW:
-        if value not in set(Arrow):
+        if not isinstance(value, str) or value not in set(Arrow):
             raise InvalidParameter(f"{str(value)[:40]!r} is no arrow", field="value", limit=", ".join(Arrow))
         return Arrow(value).value
     check_name("value", value)

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome
@@ -36,17 +38,17 @@ class PrintParameterName(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PrintThresholds:
-    """Limits of a parameter."""
+    """Values at which the grades of a parameter end."""
 
     # values at which the grades A, B, C and D end, in the unit of the parameter
     limits: tuple[float, float, float, float]
     unit: str  # ``%`` or ``1``
-    rising: bool  # whether a higher value is better
+    higher_is_better: bool
     source: str
 
     def grade(self, value: float) -> float:
         """4 to 0: the best grade whose limit the value meets."""
-        met = [value >= limit if self.rising else value <= limit for limit in self.limits]
+        met = [value >= limit if self.higher_is_better else value <= limit for limit in self.limits]
         return float(4 - met.index(True)) if any(met) else 0.0
 
 
@@ -73,28 +75,29 @@ class PrintParameter:
     """A graded parameter."""
 
     name: PrintParameterName
-    value: float  # in the unit of its thresholds
+    value: float
+    unit: str
     grade: float  # 4 (A) to 0 (F)
+    letter: str  # A, B, C, D or F
+    thresholds: PrintThresholds
     finding: str  # what was measured, in words
-    cure: str = ""  # what the printer can do about it; empty where the grade is A
-    unit_at: tuple[int, int] | None = None  # row and column of the unit that limits, from 1, of the triangle's corner
-
-    @property
-    def letter(self) -> str:
-        """A, B, C, D or F."""
-        return LETTERS[int(self.grade)]
+    cure: str | None  # what the printer can do about it; None where the grade is A
+    unit_at: Annotated[
+        tuple[int, int] | None,
+        Field(description="Row and column of the unit that limits the grade, from 1, from the triangle's corner."),
+    ]
 
 
 @dataclass(frozen=True, slots=True)
 class PrintView:
-    """How the photo shows the plate."""
+    """How a photo shows a plate."""
 
     side_px: float  # [px] mean side of the plate
     tilt_deg: float  # [deg] between the camera's axis and the plate's normal
     edge_mm: float  # [mm] width of edges, from 10 to 90 %
-    light_ratio: float  # Brightest over darkest light on the plate
-    white_level: float  # Brightest channel of the light units as the photo stores it, 0 to 255
-    focal_known: bool  # whether the focal length is that of the photo's EXIF
+    light_ratio: float  # brightest over darkest light on the plate
+    white_level: float  # brightest channel of the light units as the photo stores it, 0 to 255
+    focal_length_source: Literal["exif", "assumed"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,3 +133,25 @@ class PrintGrade:
     def limited_by(self) -> tuple[PrintParameterName, ...]:
         """The parameters that have the overall grade."""
         return tuple(parameter.name for parameter in self.parameters if parameter.grade == self.overall)
+
+
+@dataclass(frozen=True, slots=True)
+class PrintPrediction:
+    """Whether vehicles that know the registry will read a printed plate."""
+
+    speed_kmh: float  # design speed
+    camera: str  # its name
+    condition: str
+    readable_frames_per_pass: float  # mean frames of a pass in which a unit is a pixel high or more
+    # `simulated_frames`, `frames_read`: frames that were simulated with the plate's measured face, and those read with
+    # the registry
+    simulated_frames: int
+    frames_read: int
+    frames_read_alone: int  # without the registry
+    frames_wrong: int  # in which other digits were read
+    unit_height_ratio: float  # how much higher a unit's image must be than a faultless plate's
+    # `read_rate`, `faultless_read_rate`: probability that a pass reads this plate, and a faultless one
+    read_rate: float
+    faultless_read_rate: float
+    will_be_read: bool  # whether the rate reaches the rate below which plans report a marker
+    basis: str  # what the prediction rests on

@@ -5,16 +5,19 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
+from typing import Annotated
 
 import numpy as np
 import scipy
+from pydantic import Field, with_config
 
 from app.encoders.magnet.layout import PAINT, Bill, CostRow, DrillingSheet, MagnetLayout, UnitCost
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
+from app.inputs import INPUT, Number, Text
 from app.markers.magnet import MAX_LINE_SPACING_M, MIN_GAP_M, InformationTag, LineTag, Orientation
 from app.markers.magnet_design import check_name
 from app.markers.reading import Check
@@ -86,27 +89,32 @@ class Neighbour:
         check_lon_lat(self.lon_deg, self.lat_deg, "neighbours")
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What the checks need to know of the road and its traffic.
+    """What the checks need to know of the road and its traffic."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside its limits, or a kind of vehicle is unknown.
-    """
-
-    design_speed_m_s: float | None = None  # [m/s]
-    # [m] of the stop line that the tag announces, on the same line; needs the design speed
-    stop_line_chainage_m: float | None = None
-    vehicles: tuple[str, ...] = ("sedan", "utility")  # kinds of vehicle to be served, of `vehicle_clearances`
-    readable_clearance_m: float = READABLE_CLEARANCE_M  # [m] up to which clearance the decoder reads
-    neighbours: tuple[Neighbour, ...] = field(default=())  # markers nearby: of other lanes, of lines, of other tags
-    # `reaction_s`, `deceleration_m_s2`: [m/s2] of the driver or the system that acts on the tag. [s],
-    reaction_s: float = REACTION_S
-    deceleration_m_s2: float = DECELERATION_M_S2
+    design_speed_m_s: Annotated[Number | None, Field(description="Design speed, 0.5 to 70. [m/s]")] = None
+    # on the same line; needs the design speed
+    stop_line_chainage_m: Annotated[
+        Number | None, Field(description="Of the stop line that the tag announces. [m]")
+    ] = None
+    vehicles: Annotated[
+        tuple[Text, ...],
+        Field(max_length=8, description="Vehicles to be served: sedan, utility, van, heavy truck."),
+    ] = ("sedan", "utility")
+    readable_clearance_m: Annotated[
+        Number, Field(description="Clearance up to which vehicles read, 0.05 to 1. [m]")
+    ] = READABLE_CLEARANCE_M
+    reaction_s: Annotated[Number, Field(description="Reaction time of the driver or the system, 0 to 10. [s]")] = (
+        REACTION_S
+    )
+    deceleration_m_s2: Annotated[Number, Field(description="Comfortable deceleration, 0.5 to 10. [m/s2]")] = (
+        DECELERATION_M_S2
+    )
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if a value is outside its limits, or a kind of vehicle is unknown."""
         _check_range("design_speed_m_s", self.design_speed_m_s, 0.5, 70.0, "m/s")
         _check_range("stop_line_chainage_m", self.stop_line_chainage_m, -1e5, 1e5, "m")
         _check_range("readable_clearance_m", self.readable_clearance_m, 0.05, 1.0, "m")
@@ -146,8 +154,8 @@ def reaction_distance_m(
     return speed_m_s * reaction_s + speed_m_s**2 / (2 * deceleration)
 
 
-def check_layout(layout: MagnetLayout, site: Site) -> tuple[Check, ...]:
-    """Check a layout against the road and its traffic.
+def check_layout(layout: MagnetLayout, site: Site, neighbours: Sequence[Neighbour] = ()) -> tuple[Check, ...]:
+    """Check a layout against the road and its traffic, and the markers nearby: of other lanes, lines and tags.
 
     Returns
     -------
@@ -162,16 +170,16 @@ def check_layout(layout: MagnetLayout, site: Site) -> tuple[Check, ...]:
         if site.stop_line_chainage_m is not None and site.design_speed_m_s is not None:
             checks.append(_reaction(layout, site.stop_line_chainage_m, site.design_speed_m_s, site))
     checks += [_clearance(name, site.readable_clearance_m) for name in site.vehicles]
-    checks += _neighbours(layout, site.neighbours)
+    checks += _neighbours(layout, neighbours)
     return tuple(checks)
 
 
 def _at_least(name: str, figure: float, limit: float, unit: str, source: str, note: str) -> Check:
-    return Check(name, figure, ">=", limit, unit, source, figure >= limit - _TOLERANCE_M, note)
+    return Check(name, round(figure, 4), ">=", round(limit, 4), unit, source, figure >= limit - _TOLERANCE_M, note)
 
 
 def _at_most(name: str, figure: float, limit: float, unit: str, source: str, note: str) -> Check:
-    return Check(name, figure, "<=", limit, unit, source, figure <= limit + _TOLERANCE_M, note)
+    return Check(name, round(figure, 4), "<=", round(limit, 4), unit, source, figure <= limit + _TOLERANCE_M, note)
 
 
 def _spacing(layout: MagnetLayout) -> Check:
@@ -257,6 +265,8 @@ def _neighbours(layout: MagnetLayout, neighbours: Sequence[Neighbour]) -> list[C
 # === A layout with its checks and its bill of materials: what the writers of drilling sheets take.
 
 
-def drilling_sheet(layout: MagnetLayout, site: Site | None = None) -> DrillingSheet:
+def drilling_sheet(
+    layout: MagnetLayout, site: Site | None = None, neighbours: Sequence[Neighbour] = ()
+) -> DrillingSheet:
     """Check a layout and count its materials."""
-    return DrillingSheet(layout, check_layout(layout, site or Site()), bill_of_materials(layout))
+    return DrillingSheet(layout, check_layout(layout, site or Site(), neighbours), bill_of_materials(layout))

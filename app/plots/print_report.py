@@ -12,10 +12,10 @@ import numpy as np
 
 from app.encoders.pdf import Canvas, EmbeddedFont, PdfFile
 from app.errors import InvalidParameter
-from app.markers.print_grade import THRESHOLDS, PrintGrade, PrintParameter, PrintParameterName
+from app.markers.print_grade import THRESHOLDS, PrintGrade, PrintParameter, PrintParameterName, PrintPrediction
 
 if TYPE_CHECKING:
-    from app.planning.predict.printed_plate import DesignSpeed, PrintPrediction
+    from app.planning.rules import CameraRules
 
 PAGE_MM = (210.0, 297.0)
 _LEFT, _RIGHT = 15.0, 195.0
@@ -35,12 +35,11 @@ class PrintReport:
 
     grade: PrintGrade
     prediction: PrintPrediction
-    design: DesignSpeed
+    camera: CameraRules  # of the vehicles
     sha256: str  # of the photo
     at: datetime  # of the request
     marker_id: str | None
     decoder: str  # with its version
-    basis: str  # what the prediction rests on
     notes: Sequence[str]  # what a photo does not show
 
 
@@ -143,8 +142,7 @@ def _draw_table(page: _Page, parameters: Sequence[PrintParameter], y: float) -> 
     page.canvas.lines(((_LEFT, y - 1.5), (_RIGHT, y - 1.5)), width_mm=0.25, colour=_BLACK)
     y -= 5.5
     for parameter in parameters:
-        unit = THRESHOLDS[parameter.name].unit
-        value = f"{parameter.value:.1f} %" if unit == "%" else f"{parameter.value:.3g}"
+        value = f"{parameter.value:.1f} %" if parameter.unit == "%" else f"{parameter.value:.3g}"
         page.text(_COLUMNS[0], y, str(parameter.name).replace("-", " "), 7.5)
         page.text(_COLUMNS[1], y, value, 7.5)
         page.canvas.box(_COLUMNS[2], y - 0.9, 6.0, 3.8, fill=GRADE_COLOURS[int(parameter.grade)])
@@ -157,21 +155,21 @@ def _draw_table(page: _Page, parameters: Sequence[PrintParameter], y: float) -> 
 
 
 def _draw_prediction(page: _Page, report: PrintReport, y: float) -> float:
-    found, design = report.prediction, report.design
+    found, camera = report.prediction, report.camera
     sure = "will be read" if found.will_be_read else "will not be read reliably"
-    page.text(_LEFT, y, f"At {design.speed_m_s * 3.6:g} km/h the plate {sure}", 9.0, bold=True)
+    page.text(_LEFT, y, f"At {found.speed_kmh:g} km/h the plate {sure}", 9.0, bold=True)
     text = (
-        f"Camera {design.camera.name}, {design.camera.width_px} x {design.camera.height_px} px, "
-        f"{design.camera.frames_per_s:g} frames/s: {found.readable_frames:.1f} readable frames a pass; predicted read "
-        f"rate {found.read_rate:.1%} (faultless plate {found.faultless_read_rate:.1%}); units must appear "
-        f"{found.height_ratio:.2f} times as high as a faultless plate's. {report.basis}"
+        f"Camera {camera.name}, {camera.width_px} x {camera.height_px} px, "
+        f"{camera.frames_per_s:g} frames/s: {found.readable_frames_per_pass:.1f} readable frames a pass; predicted "
+        f"read rate {found.read_rate:.1%} (faultless plate {found.faultless_read_rate:.1%}); units must appear "
+        f"{found.unit_height_ratio:.2f} times as high as a faultless plate's. {found.basis}"
     )
     return page.paragraph(_LEFT, y - 4.5, text, _RIGHT - _LEFT, 7.0)
 
 
 def _draw_foot(page: _Page, report: PrintReport, y: float) -> None:
     view = report.grade.view
-    focal = "of the EXIF" if view.focal_known else "assumed"
+    focal = "of the EXIF" if view.focal_length_source == "exif" else "assumed"
     text = (
         f"Photo: the plate covers {view.side_px:.0f} px, tilt {view.tilt_deg:.1f} degrees (focal length {focal}), "
         f"edges {view.edge_mm:.2f} mm, light varies by the factor {view.light_ratio:.2f}."

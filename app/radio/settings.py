@@ -5,8 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, with_config
 
 from app.errors import InvalidParameter
+from app.inputs import INPUT, Flag, Number, Whole
 from app.markers.cerpm import MESSAGE_BYTES
 
 # === Time on air of LoRa packets.
@@ -172,37 +176,39 @@ MAX_CHANNELS = 128  # twice the 64 channels of US915
 CHANNEL_STEP = 1.6  # bandwidths between channels; source: LoRaWAN Regional Parameters, 200 kHz for 125 kHz
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class RadioSettings:
-    """Settings of the radio of a marker.
+    """How a marker's radio is set."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside its limits, or a packet is longer than the shortest interval.
-    """
-
-    frequency_hz: int = 915_000_000  # [Hz] Carrier of the lowest channel, 779 to 1,020 MHz
-    spreading_factor: int = 7  # 7 to 12, or 6 without a header
-    bandwidth_hz: int = 500_000  # [Hz] 125,000, 250,000 or 500,000
-    interval_s: float = 1.6  # [s] from one transmission to the next on average, 0.05 to 86,400
-    # each interval is drawn evenly from interval (1 - share) to interval (1 + share), 0 to 0.9: without it two markers
-    # that collide once collide every time
-    jitter_share: float = 0.2
-    # [dBm] at the antenna's connector, -4 to 20; above 17 the transmitter may send 1 % of the time
-    power_dbm: float = 20.0
-    antenna_gain_dbi: float = 2.15  # [dBi] -10 to 6
-    # number of channels that packets are spread over, 1 to 128, in steps of 1.6 bandwidths as in LoRaWAN
-    channels: int = 1
-    hopping: bool = False  # every marker uses all channels in a pseudo-random order; otherwise each uses one of them
-    # `coding_rate`, `preamble_symbols`, `explicit_header`, `crc`: see `time_on_air_s`
-    coding_rate: int = 5
-    preamble_symbols: int = 8
-    explicit_header: bool = True
-    crc: bool = True
-    lorawan: bool = False  # the message travels in a LoRaWAN frame
+    frequency_hz: Annotated[Whole, Field(description="Carrier of the lowest channel, 779 to 1,020 MHz. [Hz]")] = (
+        915_000_000
+    )
+    spreading_factor: Annotated[Whole, Field(description="7 to 12, or 6 without a header.")] = 7
+    bandwidth_hz: Annotated[Whole, Field(description="125000, 250000 or 500000. [Hz]")] = 500_000
+    interval_s: Annotated[
+        Number, Field(description="From one transmission to the next on average, 0.05 to 86,400. [s]")
+    ] = 1.6
+    # 0 to 0.9: without it two markers that collide once collide every time
+    jitter_share: Annotated[
+        Number, Field(description="Each interval is drawn evenly around that, this share to each side.")
+    ] = 0.2
+    power_dbm: Annotated[
+        Number,
+        Field(description="At the antenna's connector, -4 to 20; above 17 it may send 1 % of the time. [dBm]"),
+    ] = 20.0
+    antenna_gain_dbi: Annotated[Number, Field(description="-10 to 6. [dBi]")] = 2.15
+    # in steps of 1.6 bandwidths, as in LoRaWAN
+    channels: Annotated[Whole, Field(description="Over which packets are spread, 1 to 128.")] = 1
+    hopping: Annotated[Flag, Field(description="Every marker uses all channels in turn; else each has one.")] = False
+    coding_rate: Annotated[Whole, Field(description="5 to 8: 4/5 to 4/8.")] = 5
+    preamble_symbols: Annotated[Whole, Field(description="Length of the preamble.")] = 8
+    explicit_header: Annotated[Flag, Field(description="Whether packets have a header.")] = True
+    crc: Annotated[Flag, Field(description="Whether packets have a checksum of the radio.")] = True
+    lorawan: Annotated[Flag, Field(description="The message travels in a LoRaWAN frame.")] = False
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if a value is outside its limits, or a packet longer than the shortest interval."""
         check_modulation(self.spreading_factor, self.bandwidth_hz, explicit_header=self.explicit_header)
         check_whole("frequency_hz", self.frequency_hz, *FREQUENCIES_HZ, "Hz")
         check_between("interval_s", self.interval_s, *INTERVALS_S, "s")

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from app.families.magnet.documents import MAGNET_EXAMPLES
+from app.families.magnet.layouts import MAGNET_EXAMPLES
 
 
 class Case(NamedTuple):

@@ -19,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 
 from app.errors import CodeTaken, StaleVersion
 from app.families.documents import PositionIn
-from app.families.plate.plates import NewPlate
+from app.families.plate.plates import PlateIn
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
 from app.services.access.access import Access, Scope
@@ -56,7 +56,7 @@ class RegistryModel(RuleBasedStateMachine):
     def register(self, road: str, place: int) -> None:
         position = PositionIn(lon_deg=8.0 + place * 1e-3, lat_deg=49.0)
         with contextlib.suppress(CodeTaken):
-            made, _ = self.markers.register(self.caller, NewPlate(position, road=road))
+            made, _ = self.markers.register(self.caller, PlateIn(position=position, road=road))
             self.model[made["id"]] = (1, road, made["status"])
             self.writes += 1
 

@@ -16,9 +16,9 @@ import numpy.typing as npt
 import sqlalchemy as sa
 from scipy.spatial import cKDTree
 
-from app.families.cerpm import NewCerpm
+from app.families.cerpm import CerpmIn
 from app.families.documents import PositionIn
-from app.families.plate.plates import CodeInput, NewPlate
+from app.families.plate.plates import CodeInput, PlateIn
 from app.markers.plate import PlateCode, PlateScheme
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.column_types import new_id, row_of
@@ -104,8 +104,8 @@ def _register_templates(database: Database, caller: Caller) -> dict[str, dict[st
     place = PositionIn(lon_deg=-30.0, lat_deg=-30.0, **_SURVEY)
     common: dict[str, Any] = {"status": "surveyed", "heading_deg": 90.0, "heading_rmse_deg": 0.5, "road": "A0"}
     common |= {"measure_m": 0.0, "offset_m": 1.75}
-    use_cases.register(caller, NewPlate(place, CodeInput(PlateScheme.POSITION), **common))
-    use_cases.register(caller, NewCerpm(place, **common))
+    use_cases.register(caller, PlateIn(position=place, code=CodeInput(scheme=PlateScheme.POSITION), **common))
+    use_cases.register(caller, CerpmIn(family="cerpm", position=place, **common))
     with database.read() as connection:
         return {str(row["family"]): dict(row) for row in connection.execute(sa.select(*_COLUMNS)).mappings()}
 

@@ -127,7 +127,7 @@ def test_every_difficulty_costs_codes() -> None:
 def test_designs_without_ratio_and_designs_without_room() -> None:
     two = distinguishable(TagDesign(2, 4.0, 1.0), metro())
     assert (two.share, two.codes, two.worst_accuracy) == (1.0, 4, 1.0)
-    assert distinguishable(TagDesign(7, 2.0, 0.5), metro()).capacity == 0
+    assert distinguishable(TagDesign(7, 2.0, 0.5), metro()).codes == 0
 
 
 def test_a_design_too_large_to_list_is_sampled() -> None:

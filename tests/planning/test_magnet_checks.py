@@ -26,13 +26,18 @@ TAG = InformationTag.from_gaps("NNN", 1.0, [1, 3])
 ALL_VEHICLES = ("sedan", "utility", "van", "heavy truck")
 
 
-def checks_of(tag: InformationTag, site: Site, lane: LaneLine = STRAIGHT, chainage_m: float = 50.0) -> dict[str, Check]:
-    return {c.name: c for c in check_layout(place_tag(lane, tag, chainage_m, name="tag"), site)}
+def checks_of(
+    tag: InformationTag,
+    site: Site,
+    lane: LaneLine = STRAIGHT,
+    chainage_m: float = 50.0,
+    near: tuple[Neighbour, ...] = (),
+) -> dict[str, Check]:
+    return {c.name: c for c in check_layout(place_tag(lane, tag, chainage_m, name="tag"), site, near)}
 
 
 def test_every_check_has_figure_limit_and_source() -> None:
-    site = Site(13.41, 120.0, ALL_VEHICLES, neighbours=(Neighbour("x", 8.0001, 49.0005),))
-    checks = checks_of(TAG, site)
+    checks = checks_of(TAG, Site(13.41, 120.0, ALL_VEHICLES), near=(Neighbour("x", 8.0001, 49.0005),))
     assert set(checks) == {
         "magnet-spacing", "offset-on-bend", "reaction-distance", "clearance-sedan", "clearance-utility",
         "clearance-van", "clearance-heavy-truck", "neighbour-tag",
@@ -95,13 +100,13 @@ def beside(distance_m: float, orientation: Orientation = Orientation.FORWARD) ->
 
 
 def test_neighbours_of_other_lanes_keep_their_distance() -> None:
-    near = checks_of(TAG, Site(neighbours=(beside(1.3), beside(3.6))))["neighbour-tag"]
+    near = checks_of(TAG, Site(), near=(beside(1.3), beside(3.6)))["neighbour-tag"]
     assert (near.figure, near.limit, near.passed) == (pytest.approx(1.3, abs=1e-4), pytest.approx(1.385), False)
-    assert checks_of(TAG, Site(neighbours=(beside(3.6),)))["neighbour-tag"].passed
+    assert checks_of(TAG, Site(), near=(beside(3.6),))["neighbour-tag"].passed
     line = beside(1.3, Orientation.UP)
-    assert checks_of(TAG, Site(neighbours=(line,)))["neighbour-magnet"].passed
-    assert not checks_of(TAG, Site(neighbours=(beside(0.45, Orientation.UP),)))["neighbour-magnet"].passed
-    assert "neighbour-tag" not in checks_of(TAG, Site(neighbours=(line,)))
+    assert checks_of(TAG, Site(), near=(line,))["neighbour-magnet"].passed
+    assert not checks_of(TAG, Site(), near=(beside(0.45, Orientation.UP),))["neighbour-magnet"].passed
+    assert "neighbour-tag" not in checks_of(TAG, Site(), near=(line,))
 
 
 def test_a_long_tag_on_a_sharp_bend_leaves_the_lane(bend: LaneLine) -> None:

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 
 from app.errors import InvalidParameter, NotFound
 from app.families.documents import PositionIn
-from app.families.plate.plates import NewPlate
+from app.families.plate.plates import PlateIn
 from app.registry import agencies, audit
 from app.registry.audit import Author, find_head, list_entries, record, recording, version_sha256
 from app.registry.database import Database
@@ -60,7 +60,9 @@ def registry(database: Database) -> Registry:
         caller = Caller(agency_id, f"key of {name}", f"planner of {name}", Scope.PLANNER)
         ids = []
         for j in range(2):
-            plate = NewPlate(PositionIn(lon_deg=7.5 + k + j / 10, lat_deg=1.0, height_m=3.0), reason="Straße 大道")
+            plate = PlateIn(
+                position=PositionIn(lon_deg=7.5 + k + j / 10, lat_deg=1.0, height_m=3.0), reason="Straße 大道"
+            )
             ids.append(str(markers.register(caller, plate)[0]["id"]))
         markers.change(caller, ids[0], MarkerChange({"status": "built"}), 1)
         place = PositionIn(lon_deg=7.50001 + k, lat_deg=1.0, horizontal_rmse_m=0.01)

@@ -15,7 +15,7 @@ from alembic.runtime.migration import MigrationContext
 
 from app.errors import ClientLeft, CodeTaken, Unavailable
 from app.families.documents import PositionIn
-from app.families.plate.plates import CodeInput, NewPlate
+from app.families.plate.plates import CodeInput, PlateIn
 from app.markers.plate import PlateScheme
 from app.registry import agencies
 from app.registry.database import Database, head_revision
@@ -31,7 +31,7 @@ NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
 def _register(database: Database, lon_deg: float) -> dict[str, object]:
     caller = Caller(_agency(database), "key", "tester", Scope.PLANNER)
-    plate = NewPlate(PositionIn(lon_deg=lon_deg, lat_deg=1.0), CodeInput(PlateScheme.POSITION))
+    plate = PlateIn(position=PositionIn(lon_deg=lon_deg, lat_deg=1.0), code=CodeInput(scheme=PlateScheme.POSITION))
     return Markers(database, lambda: NOW).register(caller, plate)[0]
 
 

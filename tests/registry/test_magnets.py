@@ -11,9 +11,9 @@ import sqlalchemy as sa
 from app.encoders.magnet import CodebookRules
 from app.errors import StaleVersion
 from app.families.documents import PositionIn
-from app.families.magnet.layouts import LaneInput, NewMagnets, PlacedTag, TagInput
-from app.families.plate.plates import NewPlate
-from app.markers.magnet_design import TagDesign
+from app.families.magnet.layouts import LaneIn, LineStringIn, MagnetIn, TagIn
+from app.families.plate.plates import PlateIn
+from app.markers.magnet_design import Meaning, MeaningKind, TagDesign
 from app.registry import agencies, markers
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter, list_magnets_in, list_markers
@@ -33,9 +33,13 @@ def caller(database: Database) -> Caller:
 
 def _register(database: Database, caller: Caller, lon_deg: float = 7.0) -> dict[str, Any]:
     end_deg = (lon_deg + 0.001 + 180.0) % 360.0 - 180.0
-    lane = LaneInput(((lon_deg, 1.0), (end_deg, 1.0)), False, "geometry.coordinates", PositionIn())
-    new = NewMagnets(lane, TagInput(PlacedTag(10.0), "SNS_4_0.1_10-30"))
-    return Markers(database, lambda: NOW).register(caller, new)[0]
+    return Markers(database, lambda: NOW).register(caller, _tag(lon_deg, end_deg))[0]
+
+
+def _tag(start_deg: float, end_deg: float, offset_m: float = 0.0) -> MagnetIn:
+    line = LineStringIn(type="LineString", coordinates=[[start_deg, 1.0], [end_deg, 1.0]])
+    tag = TagIn(code="SNS_4_0.1_10-30", chainage_m=10.0, offset_m=offset_m)
+    return MagnetIn(family="magnet", lane=LaneIn(geometry=line), tag=tag)
 
 
 def _numbers(database: Database, box: Box, **filtered: Any) -> list[int]:
@@ -58,10 +62,9 @@ def test_magnets_over_the_antimeridian(database: Database, caller: Caller) -> No
     marker = _register(database, caller, lon_deg=179.99989)
     assert _signs(marker) == [1, 1, -1]
     assert _numbers(database, Box(179.9, 0.9, -179.9, 1.1)) == [1, 2, 3]
-    lane = LaneInput(((179.99989, 1.0), (-179.99911, 1.0)), False, "geometry.coordinates", PositionIn())
-    beside = NewMagnets(lane, TagInput(PlacedTag(10.0, offset_m=1.0), "SNS_4_0.1_10-30"))
+    beside = _tag(179.99989, -179.99911, offset_m=1.0)
     checks = Markers(database, lambda: NOW).register(caller, beside)[0]["checks"]
-    assert next(c for c in checks if c["name"] == "neighbour-tag")["figure"] == pytest.approx(1.0, abs=1e-3)
+    assert next(c for c in checks if c.name == "neighbour-tag").figure == pytest.approx(1.0, abs=1e-3)
 
 
 def _signs(marker: dict[str, Any]) -> list[int]:
@@ -69,10 +72,12 @@ def _signs(marker: dict[str, Any]) -> list[int]:
 
 
 def test_migration_0002_down_and_up_keeps_plates(database: Database, caller: Caller) -> None:
-    plate = NewPlate(PositionIn(lon_deg=7.0, lat_deg=1.0))
+    plate = PlateIn(position=PositionIn(lon_deg=7.0, lat_deg=1.0))
     plate_id = Markers(database, lambda: NOW).register(caller, plate)[0]["id"]
     _register(database, caller)
-    Codebooks(database, lambda: NOW).make(caller, "b", TagDesign(3, 4.0, 0.1), CodebookRules(), [("arrow", "left")])
+    Codebooks(database, lambda: NOW).make(
+        caller, "b", TagDesign(3, 4.0, 0.1), CodebookRules(), [Meaning(MeaningKind.ARROW, "left")]
+    )
     database.migrate("0001")
     with database.read() as connection:
         names = set(sa.inspect(connection).get_table_names())

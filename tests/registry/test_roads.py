@@ -9,7 +9,7 @@ import pytest
 import sqlalchemy as sa
 from pyproj import Geod
 
-from app.families.cerpm import NewCerpm
+from app.families.cerpm import CerpmIn
 from app.families.documents import PositionIn
 from app.registry.audit import audit_log
 from app.registry.database import Database
@@ -34,7 +34,7 @@ def caller(database: Database) -> Caller:
 def _fill(database: Database, caller: Caller) -> np.ndarray:
     """One registered marker, and copies of its row along the road; their distances from its start. [m]"""
     place = PositionIn(lon_deg=-30.0, lat_deg=-30.0)
-    Markers(database, lambda: NOW).register(caller, NewCerpm(place, road="A 5"))
+    Markers(database, lambda: NOW).register(caller, CerpmIn(family="cerpm", position=place, road="A 5"))
     along = np.linspace(1.0, 9_999.0, COUNT)
     same = np.ones(COUNT)
     lon, lat, _ = GEOD.fwd(LINE[0][0] * same, LINE[0][1] * same, 60 * same, along)

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from app.errors import CommitUnknown, StorageFull, Unavailable
 from app.families.documents import PositionIn
-from app.families.plate.plates import NewPlate
+from app.families.plate.plates import PlateIn
 from app.registry import agencies
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope
@@ -127,7 +127,7 @@ def test_a_second_process_is_told_who_owns_the_file(database: Database) -> None:
 def test_the_spatial_index_follows_the_table(database: Database) -> None:
     with database.write() as connection:
         caller = Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.PLANNER)
-    plate = NewPlate(PositionIn(lon_deg=7.5, lat_deg=1.0))
+    plate = PlateIn(position=PositionIn(lon_deg=7.5, lat_deg=1.0))
     marker = Markers(database, lambda: NOW).register(caller, plate)[0]
 
     def boxes() -> list[tuple[float, ...]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from fastapi.routing import APIRoute
 
 from app.api.http.middleware import is_protected
 from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
-from app.api.http.problems import MEDIA_TYPE, component_schemas
+from app.api.http.problems import MEDIA_TYPE, Mode, component_schemas
 
 _RESPONSES = "#/components/responses/"
 STORED = Path(__file__).with_name("data") / "openapi.json"
@@ -76,7 +77,9 @@ def describe(app: FastAPI) -> None:
                 tags=[{"name": name, "description": description} for name, description in _TAGS.items()],
             )  # fmt: skip
             components = document.setdefault("components", {})
-            schemas = components.get("schemas", {}) | component_schemas()
+            models = component_schemas(_models_of(app))  # X-Input and X-Output of what requests and responses have
+            others = {name: schema for name, schema in components["schemas"].items() if f"{name}-Input" not in models}
+            schemas = others | models
             components["schemas"] = dict(sorted(schemas.items()))  # else in the order of the first requests
             components["securitySchemes"] = SECURITY_SCHEMES
             components["responses"] = _share_problems(document)
@@ -86,6 +89,15 @@ def describe(app: FastAPI) -> None:
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _models_of(app: FastAPI) -> Iterator[tuple[Any, Mode]]:
+    """What the requests and responses of all routes have, besides the models that are referred to."""
+    for route in app.routes:
+        if isinstance(route, APIRoute):
+            if route.body_field is not None:
+                yield route.body_field.field_info.annotation, "validation"
+            yield from ((field.field_info.annotation, "serialization") for field in route.response_fields.values())
 
 
 def stored_text(document: dict[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from typing import Any, Literal, NamedTuple, NotRequired
 
@@ -44,10 +44,11 @@ def with_reference(response: dict[str, Any]) -> dict[str, Any]:
     return {**described, "content": {**described.get("content", {}), "application/json": {"schema": schema}}}
 
 
-def component_schemas() -> dict[str, Any]:
-    """The schemas of all models that are referred to, and of the models within them, by name."""
-    adapters: list[tuple[str, Mode, TypeAdapter[object]]] = [
-        (name, mode, TypeAdapter(model)) for name, (model, mode) in _MODELS.items()
+def component_schemas(others: Iterable[tuple[object, Mode]] = ()) -> dict[str, Any]:
+    """The schemas of all models that are referred to, of others, and of the models within them, by name."""
+    models: tuple[tuple[object, Mode], ...] = (*_MODELS.values(), *others)
+    adapters: list[tuple[int, Mode, TypeAdapter[object]]] = [
+        (number, mode, TypeAdapter(model)) for number, (model, mode) in enumerate(models)
     ]
     _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE)
     found: dict[str, Any] = schemas["$defs"]
@@ -290,7 +291,9 @@ def install_problem_handlers(app: FastAPI) -> None:
         assert isinstance(error, RequestValidationError)
         found = error.errors()
         faults = [validation_fault(item) for item in found[:MAX_ERRORS]]
-        return problem(VALIDATION, faults[0].detail, request.scope, faults, left_out=len(found) - len(faults))
+        cause = (found[0].get("ctx") or {}).get("error")
+        kind = kind_of(cause) if isinstance(cause, errors.WaymarkError) else None
+        return problem(kind or VALIDATION, faults[0].detail, request.scope, faults, left_out=len(found) - len(faults))
 
     async def on_http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)

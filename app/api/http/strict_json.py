@@ -55,9 +55,12 @@ def validated(adapter: TypeAdapter[T], value: object, *where: str) -> T:
         return adapter.validate_python(value)
     except ValidationError as error:
         if error.error_count() > _MAX_LISTED:
-            fault: Any = {"type": "invalid", "loc": where, "msg": f"{error.error_count()} values are not as documented"}
-            raise RequestValidationError([fault]) from None
+            message = f"{error.error_count()} values are not as documented"
+            raise RequestValidationError([{"type": "invalid", "loc": where, "msg": message}]) from None
         faults = error.errors(include_url=False, include_input=False)
+        for fault in faults:
+            if fault["type"] == "unexpected_keyword_argument":  # what pydantic calls it in a dataclass
+                fault["type"], fault["msg"] = _UNKNOWN, "Extra inputs are not permitted"
         names = _names_in(adapter) if any(fault["type"] == _UNKNOWN for fault in faults) else ()
         raise RequestValidationError([_located(fault, where, names) for fault in faults]) from None
 

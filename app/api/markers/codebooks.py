@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
-from pydantic import ConfigDict, Field, JsonValue
+from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, Text, Whole, use_case
+from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Text, use_case
 from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -20,10 +20,10 @@ from app.api.http.responses import (
 )
 from app.api.http.routes import Router
 from app.encoders.magnet import CodebookRules
-from app.errors import InvalidParameter, naming
-from app.families.documents import Flag, StrictModel
-from app.families.magnet.documents import MeaningIn
-from app.markers.magnet_design import OdometerError, ReadingConditions, TagDesign
+from app.errors import InvalidParameter
+from app.inputs import StrictModel
+from app.markers.magnet import MIN_GAP_M
+from app.markers.magnet_design import Meaning, TagDesign
 from app.services.markers.codebooks import (
     CodebookDocument,
     CodebookDraftDocument,
@@ -41,48 +41,18 @@ MAX_MEANINGS = 100
 """In one request: each takes up to ten milliseconds."""
 
 
-class DesignIn(StrictModel):
-    """What all tags of a book share."""
-
-    magnets: Whole = Field(description="M, 2 to 7.")
-    length_m: Number = Field(description="L, from the first magnet to the last, 0.5 to 30. [m]")
-    segment_m: Number = Field(description="Seg_d, the grid of the middle magnets; L is a whole number of it. [m]")
-    min_gap_m: Number = Field(0.5, description="Least distance between neighbours, 0.5 or more. [m]", ge=0.5)
-
-    def tag_design(self) -> TagDesign:
-        """The design as the core knows it."""
-        with naming("design"):
-            return TagDesign(self.magnets, self.length_m, self.segment_m, self.min_gap_m)
+def _keeps_apart(design: TagDesign) -> TagDesign:
+    if design.min_gap_m < MIN_GAP_M:
+        raise InvalidParameter(
+            f"min_gap_m is {design.min_gap_m:g} m: the fields of neighbours would be read as one",
+            field="min_gap_m",
+            limit=f"at least {MIN_GAP_M:g} m",
+            cure=f"leave it out for {MIN_GAP_M:g} m",
+        )
+    return design
 
 
-class OdometerIn(StrictModel):
-    """Errors of the vehicle's speed that do not cancel in a ratio."""
-
-    quantum_m_s: Number = Field(0.01, ge=0, le=5, description="Step of the speed signal. [m/s]")
-    rate_hz: Number = Field(10.0, ge=0.1, le=1000, description="Speeds a second. [Hz]")
-    drift: Number = Field(0.001, ge=0, le=0.1, description="Relative change of scale from one gap to the next.")
-
-
-class RulesIn(StrictModel):
-    """How far apart codes are kept: for the fastest and highest vehicle to be served."""
-
-    speed_m_s: Number = Field(13.4, description="Speed at which codes must be read, 0.5 to 70. [m/s]")
-    clearance_m: Number = Field(0.30, description="Clearance at which codes must be read, 0.05 to 1. [m]")
-    odometer: OdometerIn = Field(default_factory=lambda: OdometerIn())
-    confusion: Number = Field(
-        0.001, ge=1e-12, lt=0.5, description="Most probability with which a code is taken for another."
-    )
-    wrong_way_safe: Flag = Field(False, description="No code is another's reverse, nor its own.")
-    survive_missing: Flag = Field(
-        False, description="A code is recognised although one magnet is missed; from M = 4 on."
-    )
-
-    def codebook_rules(self) -> CodebookRules:
-        """The rules as the core knows them."""
-        with naming("rules"):
-            odometer = OdometerError(**self.odometer.model_dump())
-            conditions = ReadingConditions(self.speed_m_s, self.clearance_m, odometer)
-            return CodebookRules(conditions, self.confusion, self.wrong_way_safe, self.survive_missing)
+Design = Annotated[TagDesign, AfterValidator(_keeps_apart)]
 
 
 _MEANINGS_EXAMPLE: list[JsonValue] = [
@@ -109,9 +79,9 @@ class CodebookIn(StrictModel):
     )
 
     name: Text = Field(max_length=200, description="1 to 80 characters, each name once in an agency.")
-    design: DesignIn
-    rules: RulesIn = Field(default_factory=lambda: RulesIn())
-    meanings: list[MeaningIn] = Field(default_factory=list, max_length=MAX_MEANINGS)
+    design: Design
+    rules: CodebookRules = Field(default_factory=CodebookRules)
+    meanings: list[Meaning] = Field(default_factory=list, max_length=MAX_MEANINGS)
 
 
 class CodebookDraftIn(StrictModel):
@@ -121,8 +91,8 @@ class CodebookDraftIn(StrictModel):
         json_schema_extra={"examples": [{"design": {"magnets": 3, "length_m": 4.0, "segment_m": 0.1}}]},
     )
 
-    design: DesignIn
-    rules: RulesIn = Field(default_factory=lambda: RulesIn())
+    design: Design
+    rules: CodebookRules = Field(default_factory=CodebookRules)
 
 
 class MeaningsIn(StrictModel):
@@ -132,7 +102,7 @@ class MeaningsIn(StrictModel):
         json_schema_extra={"examples": [{"meanings": [{"kind": "speed-limit-mph", "value": 25}]}]},
     )
 
-    meanings: list[MeaningIn] = Field(min_length=1, max_length=MAX_MEANINGS)
+    meanings: list[Meaning] = Field(min_length=1, max_length=MAX_MEANINGS)
 
 
 # === /v1/codebooks.
@@ -156,10 +126,7 @@ def post_codebook(wanted: CodebookIn, caller: Caller, codebooks: Service, idempo
 
     Its first meanings get codes. The answer counts those that fit and are distinct.
     """
-    meanings = [meaning.pair for meaning in wanted.meanings]
-    document, replayed = codebooks.make(
-        caller, wanted.name, wanted.design.tag_design(), wanted.rules.codebook_rules(), meanings, idempotency
-    )
+    document, replayed = codebooks.make(caller, wanted.name, wanted.design, wanted.rules, wanted.meanings, idempotency)
     return created_response(document, replayed, path="/v1/codebooks")
 
 
@@ -204,8 +171,7 @@ def post_entries(
 
     They get codes: all of them or none. Codes given before stay as they are.
     """
-    meanings = [meaning.pair for meaning in wanted.meanings]
-    document, replayed = codebooks.add_meanings(caller, codebook_id, meanings, idempotency)
+    document, replayed = codebooks.add_meanings(caller, codebook_id, wanted.meanings, idempotency)
     return created_response(document, replayed)
 
 
@@ -235,7 +201,7 @@ def get_entry(
     return json_response(codebooks.entry(caller, codebook_id, code))
 
 
-def _meaning(kind: str | None, value: str | None) -> tuple[str, float | str] | None:
+def _meaning(kind: str | None, value: str | None) -> Meaning | None:
     if kind is None and value is None:
         return None
     if kind is None or value is None:
@@ -246,9 +212,10 @@ def _meaning(kind: str | None, value: str | None) -> tuple[str, float | str] | N
             cure="send both, or leave both out",
         )
     try:
-        return kind, float(value) if kind not in ("arrow", "notice") else value
+        number: float | str = float(value) if kind not in ("arrow", "notice") else value
     except ValueError:
-        return kind, value
+        number = value
+    return Meaning(kind, number)  # type: ignore[arg-type]  # it knows the kinds
 
 
 # === /v1/codebook-drafts: the capacity of a codebook before it is made. Nothing is stored.
@@ -263,4 +230,4 @@ def post_codebook_draft(wanted: CodebookDraftIn, caller: Caller) -> Response:
 
     How many there are, how many fit the rules, and the first 200 of them.
     """
-    return json_response(codebook_draft(wanted.design.tag_design(), wanted.rules.codebook_rules()))
+    return json_response(codebook_draft(wanted.design, wanted.rules))

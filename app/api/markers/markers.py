@@ -110,9 +110,9 @@ class MarkerPatch(Headed, _FamilyChanges):
         """The change as the use cases know it."""
         named = self.model_fields_set
         spec = {
-            family.name: members
+            family.name: self.model_dump(mode="json", include=members)
             for family in FAMILIES
-            if family.change is not None and (members := family.change.spec_changes(self, named))  # type: ignore[arg-type]
+            if family.change is not None and (members := named & family.change.model_fields.keys())
         }
         values = self.model_dump(include=(named & Headed.model_fields.keys() | named & {"status"}) - {"kind", "reason"})
         position = self.position if "position" in named else None
@@ -181,7 +181,7 @@ def post_marker(
 
     `position_warnings` of the response name what is probably wrong with the position.
     """
-    document, replayed = markers.register(caller, marker.root.new(), idempotency, warnings)
+    document, replayed = markers.register(caller, marker.root, idempotency, warnings)
     return created_response(document, replayed, path="/v1/markers")
 
 
@@ -418,7 +418,7 @@ def _read(item: JsonValue) -> Item:
                 cure="send one of the two",
             )
         if read.create is not None:
-            return read.create.root.new()
+            return read.create.root
         assert read.update is not None
         return MarkerUpdate(read.update.id, read.update.version, read.update.change.change())
     except RequestValidationError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import Depends, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
@@ -16,94 +16,24 @@ from app.api.http.permissions import READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, document_response, file_response, json_response
 from app.api.http.routes import Router
-from app.encoders.plate import ArtworkFormat, ArtworkOptions
+from app.encoders.plate import ArtworkFormat
 from app.errors import InvalidParameter, UnreadableUpload, naming
-from app.families.documents import POSITION_EXAMPLE, Flag, PositionIn, StrictModel
-from app.families.plate.plates import (
-    RECOMMENDED_SCHEME_NAME,
-    SCHEME_DESCRIPTION,
-    CodeIn,
-    CodeInput,
-    GeometryIn,
-    SchemeName,
-)
+from app.families.plate.plates import SCHEME_DESCRIPTION, GeometryIn
 from app.formats.format import SpooledFile
+from app.inputs import StrictModel
 from app.markers.plate import RECOMMENDED_SCHEME, PlateCode, PlateScheme, recommended_geometry
-from app.planning.proof.report import Condition
+from app.planning.predict.rates import CameraPass
 from app.planning.rules import CameraRules
-from app.services.markers.plate_drafts import CameraPassDocument, Pass, PlateDraft, PlateDraftDocument, PlateDrafts
+from app.services.markers.plate_drafts import (
+    DraftToDraw,
+    DraftToPass,
+    DraftToView,
+    PlateDraft,
+    PlateDraftDocument,
+    PlateDrafts,
+)
 from app.services.markers.print_documents import PrintGradeDocument
 from app.services.markers.print_grades import PrintDeclaration, PrintGrades
-
-# === Schemas of drafts of plates.
-
-
-_PLACE: dict[str, JsonValue] = {name: POSITION_EXAMPLE[name] for name in ("lon_deg", "lat_deg")}
-_EXAMPLES: list[JsonValue] = [
-    {"position": _PLACE, "code": {"scheme": "position-robust"}},
-    {"code": {"scheme": "id", "registry_number": 3237998146}, "geometry": {"unit_mm": 40.0}},
-]
-_PASS_EXAMPLE: dict[str, JsonValue] = {"camera": {"height_m": 1.4, "exposure_s": 0.002}, "speed_kmh": 50.0}
-
-
-class PlateDraftIn(StrictModel):
-    """A plate to see before it is registered."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": _EXAMPLES})
-
-    position: PositionIn | None = Field(None, description="Centre of the plate; the position schemes need it.")
-    code: CodeIn = Field(default_factory=CodeIn)
-    geometry: GeometryIn = Field(default_factory=GeometryIn)
-
-    def draft(self) -> PlateDraft:
-        """The draft as the use cases know it."""
-        code, scheme = self.code, PlateScheme(self.code.scheme)
-        wanted = CodeInput(scheme, code.digits, code.check_digits, code.registry_number, code.allow_mismatched_digits)
-        return PlateDraft(wanted, self.geometry.geometry(scheme), self.position)
-
-
-class DraftArtworkIn(PlateDraftIn):
-    """A plate to draw before it is registered."""
-
-    heaters: Flag = Field(False, description="Heating tracks under dark units.")
-    leds: Flag = Field(False, description="Light sources under light units.")
-    resolution_dpi: Annotated[float, Field(ge=20, le=300, allow_inf_nan=False)] = Field(
-        150.0, description="Of a PNG. [1/inch]"
-    )
-
-    def options(self) -> ArtworkOptions:
-        """What else the drawing shows."""
-        return ArtworkOptions(heaters=self.heaters, leds=self.leds)
-
-
-class CameraPassIn(PlateDraftIn):
-    """A camera that passes a plate."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [_PASS_EXAMPLE]})
-
-    camera: CameraRules = Field(default_factory=CameraRules, description="As in the rules of a plan.")
-    speed_kmh: Number = Field(60.0, ge=2.0, le=250.0, description="Speed of the vehicle. [km/h]")
-    left_m: Number = Field(0.0, ge=-5.0, le=5.0, description="Plate's centre left of the camera's path. [m]")
-
-    def way(self) -> Pass:
-        """The pass as the use cases know it."""
-        return Pass(self.camera, self.speed_kmh, self.left_m)
-
-
-class CameraViewIn(CameraPassIn):
-    """One frame of a pass."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [{**_PASS_EXAMPLE, "ahead_m": 4.0}]})
-
-    ahead_m: Number = Field(4.0, ge=0.2, le=18.0, description="From the camera to the plate's centre. [m]")
-    condition: Literal["day", "night", "rain", "shade", "wear", "dirt"] = Field(
-        "day", description="Light, weather or state of the plate, as in a proof."
-    )
-
-    def terms(self) -> Condition:
-        """The condition as the use cases know it."""
-        return Condition(self.condition)
-
 
 # === /v1/plate-drafts: plates before they are registered. Nothing is stored.
 
@@ -125,7 +55,7 @@ Drafts = Annotated[PlateDrafts, use_case(lambda cases: cases.plate_drafts)]
 
 
 @draft_router.post("", READERS, responses=document_response(PlateDraftDocument))
-def post_plate_draft(wanted: PlateDraftIn, caller: Caller, drafts: Drafts) -> Response:
+def post_plate_draft(wanted: PlateDraft, caller: Caller, drafts: Drafts) -> Response:
     """Design a plate that is not registered.
 
     Its code, units and every dimension.
@@ -133,7 +63,7 @@ def post_plate_draft(wanted: PlateDraftIn, caller: Caller, drafts: Drafts) -> Re
     Without a registry number, a plate of the scheme `id` has an example of one: registering it allocates a free one.
     Whether the code is free is not checked.
     """
-    return json_response(drafts.document(wanted.draft()))
+    return json_response(drafts.document(wanted))
 
 
 @draft_router.post(
@@ -145,14 +75,14 @@ def post_plate_draft(wanted: PlateDraftIn, caller: Caller, drafts: Drafts) -> Re
         **problem_responses(),
     },
 )
-def post_draft_artwork(form: ArtworkFormat, wanted: DraftArtworkIn, caller: Caller, drafts: Drafts) -> Response:
+def post_draft_artwork(form: ArtworkFormat, wanted: DraftToDraw, caller: Caller, drafts: Drafts) -> Response:
     """Make the artwork of a plate that is not registered.
 
     At true size, rendered and read back.
 
     There is no QR code, because the plate is not registered. The margin is labelled "a draft, not registered".
     """
-    artwork = drafts.artwork(wanted.draft(), form, wanted.options(), wanted.resolution_dpi)
+    artwork = drafts.artwork(wanted, form)
     headers = {
         "Waymark-Proof": f"read-back digits={artwork.proof.digits} confidence={artwork.proof.confidence:.6f}",
         "Content-Disposition": f'inline; filename="{artwork.file_name}"',
@@ -160,15 +90,15 @@ def post_draft_artwork(form: ArtworkFormat, wanted: DraftArtworkIn, caller: Call
     return Response(artwork.content, headers=headers, media_type=artwork.media_type)
 
 
-@draft_router.post("/pass", READERS, responses=document_response(CameraPassDocument))
-def post_camera_pass(wanted: CameraPassIn, caller: Caller, drafts: Drafts) -> Response:
+@draft_router.post("/pass", READERS, responses=document_response(CameraPass))
+def post_camera_pass(wanted: DraftToPass, caller: Caller, drafts: Drafts) -> Response:
     """Predict what a camera reads of a plate as it passes.
 
     Frames of the pass, rows of each unit, motion blur, and predicted read rates.
 
     The road is flat and straight. The rates are those that plans predict, by the fitted models of read rates.
     """
-    return json_response(drafts.camera_pass(wanted.draft(), wanted.way()))
+    return json_response(drafts.camera_pass(wanted))
 
 
 @draft_router.post(
@@ -177,14 +107,14 @@ def post_camera_pass(wanted: CameraPassIn, caller: Caller, drafts: Drafts) -> Re
     expensive=True,
     responses={**file_response(["image/jpeg"], "The picture", headers=_VIEW_HEADERS), **problem_responses()},
 )
-def post_camera_view(wanted: CameraViewIn, caller: Caller, drafts: Drafts) -> Response:
+def post_camera_view(wanted: DraftToView, caller: Caller, drafts: Drafts) -> Response:
     """Draw a plate as a camera sees it.
 
     In one frame of a pass, to scale and with motion blur; it is decoded too.
 
     Road, light, sensor and noise are simulated, the same for every picture of a condition.
     """
-    view = drafts.view(wanted.draft(), wanted.way(), wanted.ahead_m, wanted.terms())
+    view = drafts.view(wanted)
     headers = {
         "Waymark-Reading": f"{view.reading} confidence={view.confidence:.4f}",
         "Waymark-Exposure": f"{view.exposure_s:.6f}",
@@ -206,14 +136,14 @@ PRINT_EXAMPLE: dict[str, JsonValue] = {
 class PrintCodeIn(StrictModel):
     """The code that the plate should have."""
 
-    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=SCHEME_DESCRIPTION)
+    scheme: PlateScheme = Field(RECOMMENDED_SCHEME, description=SCHEME_DESCRIPTION)
     digits: Text = Field(min_length=1, max_length=64, description="One hexadecimal digit a cell, row by row.")
     check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] = Field(1, description="For `position-check`.")
 
     def code(self, n: int) -> PlateCode:
         """The code as the core knows it."""
         with naming("code"):
-            return PlateCode(self.digits, PlateScheme(self.scheme), n, self.check_digits)
+            return PlateCode(self.digits, self.scheme, n, self.check_digits)
 
 
 class PrintGradeIn(StrictModel):
@@ -240,8 +170,8 @@ class PrintGradeIn(StrictModel):
                 "the declaration names a marker and gives a code or a geometry too", field="marker_id",
                 limit="a marker, or a code and a geometry", cure="leave code and geometry out: the marker has them",
             )  # fmt: skip
-        scheme = PlateScheme(self.code.scheme) if self.code is not None else RECOMMENDED_SCHEME
-        geometry = None if self.geometry is None else self.geometry.geometry(scheme)
+        scheme = self.code.scheme if self.code is not None else RECOMMENDED_SCHEME
+        geometry = None if self.geometry is None else self.geometry.of_scheme(scheme)
         if self.code is not None and geometry is None:
             geometry = recommended_geometry(scheme)
         code = None if self.code is None or geometry is None else self.code.code(geometry.n)

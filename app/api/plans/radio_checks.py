@@ -10,11 +10,10 @@ from app.api.http.permissions import READERS
 from app.api.http.responses import document_response, json_response
 from app.api.http.routes import Router
 from app.errors import naming
-from app.families.cerpm import RadioIn
 from app.families.documents import Flag, StrictModel
 from app.planning.radio_checks import PreviewRule, RadioPlan
 from app.radio.reception import MAX_MARKERS, Receiver, RoadMarkers
-from app.radio.settings import Battery, Region
+from app.radio.settings import Battery, RadioSettings, Region
 from app.services.plans.documents import RadioCheckDocument, check_plan
 
 router = Router("/v1/radio-checks", "cerpms")
@@ -76,7 +75,7 @@ class RadioCheckIn(StrictModel):
 
     model_config = ConfigDict(json_schema_extra={"examples": _EXAMPLES})
 
-    radio: RadioIn = Field(default_factory=RadioIn)
+    radio: RadioSettings = Field(default_factory=RadioSettings)
     region: Region = Region.US915
     road: EvenRoadIn = Field(default_factory=lambda: EvenRoadIn())
     markers: PlacedMarkersIn | None = Field(None, description="In place of `road`: where each is.")
@@ -90,7 +89,6 @@ class RadioCheckIn(StrictModel):
 
     def plan(self) -> RadioPlan:
         """The plan as `app.planning` defines it."""
-        settings = self.radio.settings()
         placed = self.markers
         markers = None if placed is None else RoadMarkers(placed.chainage_m, placed.offset_m)  # type: ignore[arg-type]
         with naming("receiver"):
@@ -98,7 +96,7 @@ class RadioCheckIn(StrictModel):
         with naming("battery"):
             battery = Battery(**self.battery.model_dump())
         return RadioPlan(
-            settings,
+            self.radio,
             self.region,
             **self.road.model_dump(),
             markers=markers,

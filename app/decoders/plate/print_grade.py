@@ -25,7 +25,7 @@ from app.decoders.plate.print_face import (
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, decode_plates
 from app.errors import PrintNotGraded
 from app.markers.plate import PlateCode, PlateGeometry, reed_solomon_words, unit_index
-from app.markers.print_grade import THRESHOLDS, PrintGrade, PrintParameter, PrintParameterName, PrintView
+from app.markers.print_grade import LETTERS, THRESHOLDS, PrintGrade, PrintParameter, PrintParameterName, PrintView
 from app.markers.reading import PlateReading
 
 # === Parameters of a print grade: what was measured on a face -> values, grades, causes and cures.
@@ -87,12 +87,19 @@ def reflectance_margins(face: MeasuredFace, code: PlateCode) -> Array:
 
 
 def _graded(
-    name: PrintParameterName, value: float, finding: str, cure: str, unit_at: tuple[int, int] | None = None,
+    name: PrintParameterName,
+    value: float,
+    finding: str,
+    cure: str,
+    unit_at: tuple[int, int] | None = None,
     grade: float | None = None,
-) -> PrintParameter:  # fmt: skip
-    value = round(float(value), 4)
-    found = THRESHOLDS[name].grade(value) if grade is None else grade
-    return PrintParameter(name, value, found, finding, cure if found < 4 else "", unit_at)
+) -> PrintParameter:
+    value, thresholds = round(float(value), 4), THRESHOLDS[name]
+    found = thresholds.grade(value) if grade is None else grade
+    cure_of_found = cure if found < 4 else None
+    return PrintParameter(
+        name, value, thresholds.unit, found, LETTERS[int(found)], thresholds, finding, cure_of_found, unit_at
+    )
 
 
 # --- reflectance ------------------------------------------------------------------------------------------------------
@@ -543,7 +550,12 @@ def _view(photo: Image, face: MeasuredFace, geometry: PlateGeometry, focal_35mm:
     corners_px = cv2.perspectiveTransform(square, face.image_from_face)[0]
     tilt_deg = _axes(photo, face.image_from_face, geometry, focal_35mm)[1]
     return PrintView(
-        _side_px(corners_px), tilt_deg, face.edge_mm, face.light_ratio, face.white_level, focal_35mm is not None
+        _side_px(corners_px),
+        tilt_deg,
+        face.edge_mm,
+        face.light_ratio,
+        face.white_level,
+        "assumed" if focal_35mm is None else "exif",
     )
 
 
@@ -556,9 +568,10 @@ def _check_view(view: PrintView, geometry: PlateGeometry) -> None:
             limit=f"at most {limit_mm:.1f} mm from 10 to 90 %, {MAX_EDGE_GAPS:g} of a gap",
             cure="hold the camera still, focus on the plate, and come nearer; if every photo shows it, the ink bleeds",
         )
-    limit_deg = MAX_TILT_DEG if view.focal_known else MAX_TILT_ASSUMED_DEG
+    from_exif = view.focal_length_source == "exif"
+    limit_deg = MAX_TILT_DEG if from_exif else MAX_TILT_ASSUMED_DEG
     if view.tilt_deg > limit_deg:
-        known = "" if view.focal_known else " (30 degrees with the focal length in the photo's EXIF)"
+        known = "" if from_exif else " (30 degrees with the focal length in the photo's EXIF)"
         raise PrintNotGraded(
             f"the photo is oblique: the camera is tilted by {view.tilt_deg:.0f} degrees against the plate",
             field="photo",

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, with_config
 
 from app.errors import Conflict, InvalidParameter
+from app.inputs import INPUT, Flag, Number
 from app.markers.magnet import InformationTag, Polarity
 from app.markers.magnet_design import (
     MAX_PLACEMENTS,
     Codebook,
     Meaning,
+    OdometerError,
     ReadingConditions,
     TagDesign,
     covariance_of,
@@ -31,20 +34,33 @@ class CodebookFull(Conflict):
     """No further code keeps the distance to the others that the rules ask for."""
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class CodebookRules:
-    """How far apart codes are kept."""
+    """How far apart codes are kept: for the fastest and highest vehicle to be served."""
 
-    # the worst under which the codes must be read
-    conditions: ReadingConditions = field(default_factory=ReadingConditions)
-    # largest probability with which a code may be taken for another one, the polarities being read right
-    confusion: float = 0.001
-    # no code is the reverse of another one, nor its own, nor too near to it: every reading shows the direction
-    wrong_way_safe: bool = False
-    survive_missing: bool = False  # a code is read even when any one of its magnets is missed; from four magnets on
+    speed_m_s: Annotated[Number, Field(description="Speed at which codes must be read, 0.5 to 70. [m/s]")] = 13.4
+    clearance_m: Annotated[Number, Field(description="Clearance at which codes must be read, 0.05 to 1. [m]")] = 0.30
+    odometer: OdometerError = field(default_factory=OdometerError)
+    # the polarities being read right
+    confusion: Annotated[
+        Number, Field(ge=1e-12, lt=0.5, description="Most probability with which a code is taken for another.")
+    ] = 0.001
+    # nor too near to it: every reading shows the direction
+    wrong_way_safe: Annotated[Flag, Field(description="No code is another's reverse, nor its own.")] = False
+    survive_missing: Annotated[
+        Flag, Field(description="A code is recognised although one magnet is missed; from M = 4 on.")
+    ] = False
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if a value is outside its limits."""
+        _ = self.conditions
         separation_for(self.confusion)
+
+    @property
+    def conditions(self) -> ReadingConditions:
+        """The worst conditions under which the codes must be read."""
+        return ReadingConditions(self.speed_m_s, self.clearance_m, self.odometer)
 
 
 def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookRules) -> Codebook:

@@ -117,19 +117,7 @@ def _summary(sheet: DrillingSheet) -> dict[str, object]:
         "length_m": round(layout.length_m, 4),
         "origin": {"lon_deg": lon_deg, "lat_deg": lat_deg, "height_m": height_m},
         "passed": sheet.passed,
-        "checks": [
-            {
-                "name": check.name,
-                "figure": round(check.figure, 4),
-                "relation": check.relation,
-                "limit": round(check.limit, 4),
-                "unit": check.unit,
-                "passed": check.passed,
-                "source": check.source,
-                "note": check.note,
-            }
-            for check in sheet.checks
-        ],
+        "checks": list(sheet.checks),
         "bill": {
             part: [
                 {

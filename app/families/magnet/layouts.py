@@ -1,29 +1,181 @@
-"""A magnet marker's layout: kept as a lane, a tag and a place on it, from which everything else follows."""
+"""Magnet markers as requests have them, and their layout: kept as a lane, a tag and a place on it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, ClassVar, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import orjson
+from pydantic import ConfigDict, Field, JsonValue, model_validator
 from pyproj import Geod
 from typing_extensions import TypedDict
 
 from app.encoders.magnet import DrillingSheet, MagnetLayout, place_line, place_tag
 from app.errors import InvalidParameter, naming
-from app.families.documents import PositionIn
-from app.families.surveys import NewMarker
+from app.families.documents import Height, MarkerIn, Metres, ProvenanceIn
 from app.geodesy import PlacedPosition, place_position
+from app.inputs import Identifier, Number, StrictModel, Text
 from app.markers.magnet import InformationTag, LineStyle, LineTag, Orientation, parse_tag
 from app.markers.magnet_design import Meaning, MeaningKind
 from app.markers.reading import Check
 from app.planning.magnet_checks import Neighbour, Site, drilling_sheet
 from app.registry.marker_rows import MarkerRow
 from app.roads.lane_line import LaneLine
+
+# === Requests that register magnet markers.
+
+
+MAX_LANE_POINTS = 2000
+MAX_TAG_MAGNETS = 7  # source: `TagDesign`, seven magnets
+MAX_MAGNETS = 1000
+"""Of one marker, so that no request takes long: six kilometres of a line."""
+_GEOD = Geod(ellps="WGS84")
+
+
+class LineStringIn(StrictModel):
+    """A GeoJSON LineString (RFC 7946) in the direction of travel."""
+
+    type: Literal["LineString"]
+    coordinates: list[Annotated[list[Number], Field(min_length=2, max_length=3)]] = Field(
+        min_length=2,
+        max_length=MAX_LANE_POINTS,
+        description="Longitude and latitude of each vertex [deg]; heights are left out.",
+    )
+
+
+class LaneIn(ProvenanceIn):
+    """The line that chainages are measured on, in the direction of legal travel, and where it comes from."""
+
+    geometry: LineStringIn | None = Field(None, description="Longitude and latitude in a geographic CRS.")
+    points_m: list[Annotated[list[Metres], Field(min_length=2, max_length=2)]] | None = Field(
+        None, min_length=2, max_length=MAX_LANE_POINTS, description="Easting and northing in a projected CRS. [m]"
+    )
+    height_m: Height | None = Field(None, description="Height of the road, at which distances are true. [m]")
+
+    @model_validator(mode="after")
+    def _one_line(self) -> LaneIn:
+        if (self.geometry is None) == (self.points_m is None):
+            raise InvalidParameter(
+                "a lane is a geometry of longitudes and latitudes, or points_m with a projected crs",
+                limit="one of geometry, points_m",
+                cure="send exactly one of the two",
+            )
+        return self
+
+    @property
+    def is_projected(self) -> bool:
+        """Whether the points are eastings and northings."""
+        return self.geometry is None
+
+    @property
+    def points(self) -> list[tuple[float, float]]:
+        """Longitude and latitude [deg], or easting and northing [m], of each vertex."""
+        return [(p[0], p[1]) for p in (self.points_m if self.geometry is None else self.geometry.coordinates) or ()]
+
+
+class TagPlace(StrictModel):
+    """Where the first magnet of an information tag lies."""
+
+    chainage_m: Number = Field(description="Of the first magnet, along the lane. [m]")
+    offset_m: Number = Field(0.0, description="Of the tag from the lane, left positive, up to 50. [m]")
+
+
+class TagIn(TagPlace):
+    """An information tag, by its code or by what it means in a codebook, and where its first magnet lies."""
+
+    code: Text | None = Field(
+        None, min_length=1, max_length=64, description="Polarities, length [m], segment [m], gaps: SNS_4_0.1_10-30."
+    )
+    codebook_id: Identifier | None = Field(None, description="Codebook of the meaning, or that the code must be in.")
+    meaning: Meaning | None = Field(None, description="What the tag means; its code is the codebook's.")
+
+
+class LinePlace(StrictModel):
+    """Which part of a line carries magnets."""
+
+    from_m: Number = Field(0.0, description="Chainage of the first magnet. [m]")
+    to_m: Number | None = Field(None, description="Chainage of the last magnet; the end of the line if left out. [m]")
+    spacing_m: Number = Field(
+        6.0, description="Most that neighbours may be apart, 0.5 to 6; it is evened out over the section. [m]"
+    )
+
+
+class LineIn(LinePlace):
+    """Line tags along the lane, which is the painted line."""
+
+    style: LineStyle = Field(description="What is painted.")
+
+
+_LANE_EXAMPLE: dict[str, JsonValue] = {
+    "geometry": {"type": "LineString", "coordinates": [[-84.48, 42.7263], [-84.4776, 42.7263]]},
+    "horizontal_rmse_m": 0.02,
+    "realization": "ITRF2014",
+    "survey_method": "GNSS RTK",
+}
+MAGNET_EXAMPLES: list[JsonValue] = [
+    {
+        "family": "magnet",
+        "lane": _LANE_EXAMPLE,
+        "tag": {"code": "SNS_4_0.1_10-30", "chainage_m": 60.0},
+        "site": {"design_speed_m_s": 13.4, "stop_line_chainage_m": 130.0},
+        "road": "Farm Lane",
+    },
+    {
+        "family": "magnet",
+        "lane": {
+            "geometry": {"type": "LineString", "coordinates": [[-84.48, 42.72635], [-84.4776, 42.72635]]},
+        },
+        "line": {"style": "dashed", "from_m": 10.0, "to_m": 100.0, "spacing_m": 6.0},
+    },
+]
+
+
+class MagnetIn(MarkerIn):
+    """An information tag, or a line of line tags, to register."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": MAGNET_EXAMPLES})
+
+    family: Literal["magnet"]
+    lane: LaneIn
+    tag: TagIn | None = None
+    line: LineIn | None = None
+    site: Site = Field(default_factory=Site)
+
+    @model_validator(mode="after")
+    def _tag_or_line(self) -> MagnetIn:
+        if (self.tag is None) == (self.line is None):
+            raise InvalidParameter(
+                "magnets are an information tag or a line of line tags",
+                field="tag",
+                limit="one of tag, line",
+                cure="send exactly one of the two",
+            )
+        return self
+
+    @property
+    def place(self) -> dict[str, float | None]:
+        """The place of the tag or the line on the lane, as it is stored."""
+        what = self.tag or self.line
+        assert what is not None
+        return what.model_dump(include=set((TagPlace if self.tag else LinePlace).model_fields))
+
+    @property
+    def part_count(self) -> int:
+        """Magnets of a line, from its length; up to those that one marker may have."""
+        if self.line is None:
+            return MAX_TAG_MAGNETS
+        points = self.lane.points
+        if self.lane.is_projected:
+            length_m = sum(math.dist(one, other) for one, other in pairwise(points))
+        else:
+            length_m = _GEOD.line_length([p[0] for p in points], [p[1] for p in points])
+        line = self.line
+        to_m = length_m if line.to_m is None else min(line.to_m, length_m)
+        count = (to_m - line.from_m) / line.spacing_m if line.spacing_m > 0 else math.inf
+        return 1 + math.ceil(min(max(count, 0.0), MAX_MAGNETS))
+
 
 # === What the row of a magnet marker has in its column `spec`.
 
@@ -35,38 +187,12 @@ class StoredMeaning(TypedDict):
     value: float | str
 
 
-class TagPlaceDocument(TypedDict):
-    """Where an information tag lies on its lane."""
-
-    chainage_m: float
-    offset_m: float
-
-
-class LinePlaceDocument(TypedDict):
-    """Which part of a line carries magnets."""
-
-    from_m: float
-    to_m: float | None
-    spacing_m: float
-
-
 class StoredLane(TypedDict):
     """Vertices in WGS 84, and in `given` the coordinates that were sent where they were of another system."""
 
     points_deg: list[list[float]]
     height_m: float | None
     given: list[list[float]] | None
-
-
-class SiteDocument(TypedDict):
-    """What the checks know of the road and its traffic."""
-
-    design_speed_m_s: float | None
-    stop_line_chainage_m: float | None
-    vehicles: list[str]
-    readable_clearance_m: float
-    reaction_s: float
-    deceleration_m_s2: float
 
 
 class StoredNeighbour(TypedDict):
@@ -86,8 +212,8 @@ class MagnetSpec(TypedDict):
     codebook_id: str | None
     meaning: StoredMeaning | None
     lane: StoredLane
-    place: TagPlaceDocument | LinePlaceDocument
-    site: SiteDocument
+    place: dict[str, float | None]  # of `TagPlace` or `LinePlace`
+    site: dict[str, Any]  # of `Site`
     neighbours: list[StoredNeighbour]
 
 
@@ -103,43 +229,13 @@ def meaning_of(spec: MagnetSpec) -> Meaning | None:
 INFORMATION_TAG: Final = "information-tag"
 LINE_TAG: Final = "line-tag"
 _LAID_OUT: Final = ("lane", "tag", "place", "meaning")
-MAX_MAGNETS = 1000
-"""Of one marker, so that no request takes long: six kilometres of a line."""
 MAX_RESURVEY_M = 1.0
 """Farthest that a survey may find a tag from its layout: drilling is right to millimetres, GNSS to centimetres. [m]"""
 _NEVER_BROKEN = ("magnet-spacing", "line-spacing")
 """Checks whose failure makes a layout unreadable; the others are for the planner to weigh."""
 
 
-@dataclass(frozen=True, slots=True)
-class LaneInput:
-    """A line in the direction of travel as it was sent."""
-
-    # longitude and latitude [deg], or easting and northing [m] where `projected`
-    coordinates: tuple[tuple[float, float], ...]
-    projected: bool
-    field: str  # name of the coordinates in errors
-    provenance: PositionIn  # height and reference system, and how the line was surveyed; without coordinates
-
-
-@dataclass(frozen=True, slots=True)
-class PlacedTag:
-    """Where an information tag lies on its lane. [m]"""
-
-    chainage_m: float
-    offset_m: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class PlacedLine:
-    """Which part of a line carries magnets, and how far apart at most. [m]"""
-
-    from_m: float = 0.0
-    to_m: float | None = None
-    spacing_m: float = 6.0
-
-
-def place_lane(lane: LaneInput, accuracy_m: float) -> list[PlacedPosition]:
+def place_lane(lane: LaneIn, accuracy_m: float) -> list[PlacedPosition]:
     """Every vertex in WGS 84 / ITRF.
 
     Raises
@@ -147,34 +243,35 @@ def place_lane(lane: LaneInput, accuracy_m: float) -> list[PlacedPosition]:
     InvalidParameter, ReferenceSystemError
         A vertex is out of range or does not fit the CRS.
     """
-    placed, given = [], lane.provenance
-    for number, (first, second) in enumerate(lane.coordinates):
+    placed = []
+    for number, (first, second) in enumerate(lane.points):
         try:
             position = place_position(
                 first,
                 second,
-                given.height_m,
-                crs=given.crs,
-                projected=lane.projected,
-                realization=given.realization,
-                epoch=given.epoch,
-                ellipsoidal_height=given.vertical_datum in (None, "ellipsoid"),
+                lane.height_m,
+                crs=lane.crs,
+                projected=lane.is_projected,
+                realization=lane.realization,
+                epoch=lane.epoch,
+                ellipsoidal_height=lane.vertical_datum in (None, "ellipsoid"),
                 accuracy_m=accuracy_m,
             )
         except InvalidParameter as error:
-            error.field = "lane.crs" if error.field == "position.crs" else f"lane.{lane.field}.{number}"
+            points = "points_m" if lane.is_projected else "geometry.coordinates"
+            error.field = "lane.crs" if error.field == "position.crs" else f"lane.{points}.{number}"
             raise
         placed.append(position)
     return placed
 
 
-def lane_spec(lane: LaneInput, placed: list[PlacedPosition]) -> StoredLane:
+def lane_spec(lane: LaneIn, placed: list[PlacedPosition]) -> StoredLane:
     """What is kept of a lane: its vertices in WGS 84, and as they came where that was another system."""
     points_deg = [[p.lon_deg, p.lat_deg] for p in placed]
-    sent = [list(point) for point in lane.coordinates]
+    sent = [list(point) for point in lane.points]
     return {
         "points_deg": points_deg,
-        "height_m": lane.provenance.height_m,
+        "height_m": lane.height_m,
         "given": sent if sent != points_deg else None,
     }
 
@@ -191,18 +288,11 @@ def layout_of(name: str, spec: MagnetSpec) -> MagnetLayout:
 
 def sheet_of(name: str, spec: MagnetSpec) -> DrillingSheet:
     """Drilling sheet of a magnet marker by its id and its spec."""
-    return drilling_sheet(layout_of(name, spec), site_of(spec))
-
-
-def site_of(spec: MagnetSpec) -> Site:
-    """What the checks need to know of the road."""
-    stored: Mapping[str, Any] = spec["site"]
-    site = {name: value for name, value in stored.items() if value is not None}
-    neighbours = tuple(
+    neighbours = [
         Neighbour(n["name"], n["lon_deg"], n["lat_deg"], Orientation(n["phi_deg"])) for n in spec["neighbours"]
-    )
-    with naming("site"):
-        return Site(**{**site, "vehicles": tuple(stored["vehicles"])}, neighbours=neighbours)
+    ]
+    site = Site(**{**spec["site"], "vehicles": tuple(spec["site"]["vehicles"])})
+    return drilling_sheet(layout_of(name, spec), site, neighbours)
 
 
 @lru_cache(maxsize=32)
@@ -213,7 +303,7 @@ def _layout(name: str, spec: bytes) -> MagnetLayout:
     tag, meaning = parse_tag(stored["tag"]), meaning_of(stored)
     if isinstance(tag, LineTag):
         with naming("line"):
-            return _place_line(lane, tag, PlacedLine(**place), name)
+            return _place_line(lane, tag, LinePlace(**place), name)
     with naming("tag"):
         return place_tag(lane, tag, place["chainage_m"], name=name, offset_m=place["offset_m"], meaning=meaning)
 
@@ -226,7 +316,7 @@ def _lane(spec: StoredLane) -> LaneLine:
         raise
 
 
-def _place_line(lane: LaneLine, tag: LineTag, place: PlacedLine, name: str) -> MagnetLayout:
+def _place_line(lane: LaneLine, tag: LineTag, place: LinePlace, name: str) -> MagnetLayout:
     end_m = lane.length_m if place.to_m is None else place.to_m
     if place.spacing_m > 0 and end_m - place.from_m > place.spacing_m * (MAX_MAGNETS - 1):
         raise InvalidParameter(
@@ -284,67 +374,16 @@ def resurveyed(row: MarkerRow, lon_deg: float, lat_deg: float) -> MagnetSpec:
             limit=f"within {MAX_RESURVEY_M:g} m",
             cure="check the CRS; a tag somewhere else is another marker: retire this one and register it there",
         )
-    place = PlacedTag(**row.spec["place"])
+    place = TagPlace(**row.spec["place"])
     for _ in range(20):  # a step is exact on a straight; on a bend the direction of the tag turns with its place
         east, north = (target - layout.holes[0].point_enu_m[:2]).tolist()
         if math.hypot(east, north) < 1e-7:
             break
         h = math.radians(layout.bearing_deg)
-        place = PlacedTag(
-            place.chainage_m + east * math.sin(h) + north * math.cos(h),
-            place.offset_m - east * math.cos(h) + north * math.sin(h),
+        place = TagPlace(
+            chainage_m=place.chainage_m + east * math.sin(h) + north * math.cos(h),
+            offset_m=place.offset_m - east * math.cos(h) + north * math.sin(h),
         )
-        spec = {**spec, "place": {"chainage_m": place.chainage_m, "offset_m": place.offset_m}}
+        spec = {**spec, "place": place.model_dump()}
         layout = layout_of(row.id, spec)
     return spec
-
-
-# === Magnets that are to be registered, as their use case knows them.
-
-
-MAX_TAG_MAGNETS = 7  # source: `TagDesign`, seven magnets
-_GEOD = Geod(ellps="WGS84")
-
-
-@dataclass(frozen=True, slots=True)
-class TagInput:
-    """An information tag to place, named by its text or by its meaning in a codebook."""
-
-    place: PlacedTag
-    code: str | None = None
-    codebook_id: str | None = None
-    meaning: tuple[str, float | str] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class LineInput:
-    """A line of line tags to place."""
-
-    place: PlacedLine
-    style: LineStyle
-
-
-@dataclass(frozen=True, slots=True)
-class NewMagnets(NewMarker):
-    """A tag or a line of magnets to register."""
-
-    family: ClassVar[str] = "magnet"
-    lane: LaneInput
-    what: TagInput | LineInput
-    site: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def part_count(self) -> int:
-        """Magnets of a line, from its length; up to those that one marker may have."""
-        if isinstance(self.what, TagInput):
-            return MAX_TAG_MAGNETS
-        first, second = zip(*self.lane.coordinates, strict=True)
-        length_m = _GEOD.line_length(first, second) if not self.lane.projected else _plane_length(first, second)
-        place = self.what.place
-        to_m = length_m if place.to_m is None else min(place.to_m, length_m)
-        count = (to_m - place.from_m) / place.spacing_m if place.spacing_m > 0 else math.inf
-        return 1 + math.ceil(min(max(count, 0.0), MAX_MAGNETS))
-
-
-def _plane_length(east: tuple[float, ...], north: tuple[float, ...]) -> float:
-    return sum(math.dist(one, other) for one, other in pairwise(zip(east, north, strict=True)))

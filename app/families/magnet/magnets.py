@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import scipy
@@ -13,30 +13,20 @@ import sqlalchemy as sa
 
 from app.encoders.magnet import MagnetLayout, SheetFormat, write_sheet
 from app.errors import CodeMismatch, Conflict, InvalidParameter, naming
-from app.families.documents import PositionIn, position_columns
+from app.families.documents import position_columns
 from app.families.family import Family, Registration
-from app.families.magnet.documents import (
-    MAGNET_EXAMPLES,
-    MagnetDetailDocument,
-    MagnetDocument,
-    MagnetIn,
-    magnet_detail,
-    magnet_document,
-)
+from app.families.magnet.documents import MagnetDetailDocument, MagnetDocument, magnet_detail, magnet_document
 from app.families.magnet.layouts import (
     INFORMATION_TAG,
     LINE_TAG,
+    MAGNET_EXAMPLES,
     MAX_MAGNETS,
-    LaneInput,
-    LineInput,
-    LinePlaceDocument,
+    LaneIn,
+    LineIn,
+    LineStringIn,
+    MagnetIn,
     MagnetSpec,
-    NewMagnets,
-    PlacedLine,
-    PlacedTag,
-    SiteDocument,
-    TagInput,
-    TagPlaceDocument,
+    TagIn,
     check_never_broken,
     lane_spec,
     layout_of,
@@ -48,7 +38,7 @@ from app.families.magnet.layouts import (
 from app.families.surveys import PLAN_METHOD, Commitment, MarkerRules, PlannedRow, is_placed_again
 from app.markers.magnet import MIN_GAP_M, InformationTag, LineStyle, LineTag, Orientation, Tag, parse_tag
 from app.markers.magnet_design import Meaning
-from app.planning.magnet_checks import HALF_BAR_M, Neighbour, Site
+from app.planning.magnet_checks import HALF_BAR_M, Neighbour
 from app.planning.magnet_stretches import even_stretches, lane_around, spacing_of
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedLineMagnet, PlannedMarker, PlannedTag
@@ -157,7 +147,7 @@ def magnets_of_map(row: MarkerRow) -> list[MapMarker]:
 
 
 def magnet_columns(
-    new: NewMagnets, tag: Tag, meaning: Meaning | None, rules: MarkerRules, now: datetime
+    new: MagnetIn, tag: Tag, meaning: Meaning | None, rules: MarkerRules, now: datetime
 ) -> dict[str, Any]:
     """Columns of a tag or a line of magnets that breaks no limit by itself.
 
@@ -167,24 +157,21 @@ def magnet_columns(
         The lane or the site cannot be, or magnets would stand too near or too far apart.
     """
     placed = place_lane(new.lane, rules.crs_accuracy_m)
-    with naming("site"):
-        site = asdict(Site(**new.site))
-    del site["neighbours"]
     marker_id = new_id(now)
     spec: MagnetSpec = {
         "kind": LINE_TAG if isinstance(tag, LineTag) else INFORMATION_TAG,
         "tag": tag.text,
-        "codebook_id": new.what.codebook_id if isinstance(new.what, TagInput) else None,
+        "codebook_id": None if new.tag is None else new.tag.codebook_id,
         "meaning": None if meaning is None else {"kind": meaning.kind.value, "value": meaning.value},
         "lane": lane_spec(new.lane, placed),
-        "place": cast(TagPlaceDocument | LinePlaceDocument, asdict(new.what.place)),
-        "site": cast(SiteDocument, site),
+        "place": new.place,
+        "site": asdict(new.site),
         "neighbours": [],
     }
     layout, sheet = layout_of(marker_id, spec), sheet_of(marker_id, spec)
     check_never_broken(layout, sheet.checks)
     first = layout.holes[0]
-    columns = position_columns(new.lane.provenance, worst_grade(placed))
+    columns = position_columns(new.lane, worst_grade(placed))
     placed_at = {name: value for name, value in spec["place"].items() if value is not None}
     return {
         "id": marker_id,
@@ -205,44 +192,41 @@ def magnet_columns(
 
 def _planned_tag(commitment: Commitment, marker: PlannedMarker, detail: PlannedTag) -> PlannedRow:
     lon, lat, along_m = lane_around(commitment.alignment.lane(marker.lane), marker)
-    lane_input = _lane_input(commitment, lon.tolist(), lat.tolist(), marker.height_m)
-    place = PlacedTag(along_m, marker.offset_m)
-    what = TagInput(place, code=detail.tag.text, codebook_id=commitment.codebook_id)
-    columns = magnet_columns(
-        NewMagnets(lane=lane_input, what=what), detail.tag, detail.meaning, commitment.rules, commitment.now
-    )
+    tag = TagIn(code=detail.tag.text, codebook_id=commitment.codebook_id, chainage_m=along_m, offset_m=marker.offset_m)
+    lane = _planned_lane(commitment, np.column_stack([lon, lat]).tolist(), marker.height_m)
+    new = MagnetIn(family="magnet", lane=lane, tag=tag)
+    columns = magnet_columns(new, detail.tag, detail.meaning, commitment.rules, commitment.now)
     return PlannedRow(marker.number, columns | {"original": commitment.original(marker)})
 
 
 def _planned_line(commitment: Commitment, stretch: Sequence[PlannedMarker]) -> PlannedRow:
-    lon, lat = [marker.lon_deg for marker in stretch], [marker.lat_deg for marker in stretch]
-    lane_input = _lane_input(commitment, lon, lat, stretch[0].height_m)
-    detail = stretch[0].detail
+    detail, height_m = stretch[0].detail, stretch[0].height_m
     assert isinstance(detail, PlannedLineMagnet)
-    line = LaneLine.from_lon_lat(list(zip(lon, lat, strict=True)), stretch[0].height_m or 0.0)
-    spacing_m = spacing_of(line)
+    points = [[marker.lon_deg, marker.lat_deg] for marker in stretch]
+    spacing_m = spacing_of(LaneLine.from_lon_lat(points, height_m or 0.0))
     style = LineStyle.SOLID if detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
-    what = LineInput(PlacedLine(spacing_m=spacing_m), style)
-    columns = magnet_columns(NewMagnets(lane=lane_input, what=what), detail.tag, None, commitment.rules, commitment.now)
+    lane, line = _planned_lane(commitment, points, height_m), LineIn(spacing_m=spacing_m, style=style)
+    new = MagnetIn(family="magnet", lane=lane, line=line)
+    columns = magnet_columns(new, detail.tag, None, commitment.rules, commitment.now)
     return PlannedRow(stretch[0].number, columns | {"original": commitment.original(stretch[0])}, len(stretch))
 
 
-def _lane_input(commitment: Commitment, lon: list[float], lat: list[float], height_m: float | None) -> LaneInput:
+def _planned_lane(commitment: Commitment, points_deg: list[list[float]], height_m: float | None) -> LaneIn:
     road = commitment.alignment
-    provenance = PositionIn(
+    return LaneIn(
+        geometry=LineStringIn(type="LineString", coordinates=points_deg),
         height_m=height_m,
         realization=road.realization,
         epoch=road.epoch,
         vertical_datum=road.vertical_datum if height_m is not None else None,
         survey_method=PLAN_METHOD,
     )
-    return LaneInput(tuple(zip(lon, lat, strict=True)), False, "points_deg", provenance)
 
 
 # === The family of magnet markers.
 
 
-class Magnets(Family[NewMagnets, dict[str, Any]]):
+class Magnets(Family[MagnetIn, dict[str, Any]]):
     """The family of magnet markers."""
 
     name = "magnet"
@@ -256,7 +240,7 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
     document_type = MagnetDocument
     detail_type = MagnetDetailDocument
 
-    def prepare(self, registration: Registration, new: NewMagnets) -> dict[str, Any]:
+    def prepare(self, registration: Registration, new: MagnetIn) -> dict[str, Any]:
         """Columns of a layout that breaks no limit by itself.
 
         Raises
@@ -266,11 +250,11 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
         InvalidParameter, CodeMismatch, ReferenceSystemError
             The tag, the lane or the site cannot be, or magnets would stand too near or too far apart.
         """
-        tag, meaning = _find_tag(registration, new.what)
+        tag, meaning = _find_tag(registration, new)
         return magnet_columns(new, tag, meaning, registration.rules, registration.now)
 
     def columns(
-        self, connection: sa.Connection, registration: Registration, new: NewMagnets, prepared: dict[str, Any]
+        self, connection: sa.Connection, registration: Registration, new: MagnetIn, prepared: dict[str, Any]
     ) -> dict[str, Any]:
         """The columns, with the markers nearby.
 
@@ -374,9 +358,11 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
 MAGNET = Magnets()
 
 
-def _find_tag(registration: Registration, what: TagInput | LineInput) -> tuple[Tag, Meaning | None]:
-    if isinstance(what, LineInput):
-        return LineTag.of_style(what.style), None
+def _find_tag(registration: Registration, new: MagnetIn) -> tuple[Tag, Meaning | None]:
+    if new.line is not None:
+        return LineTag.of_style(new.line.style), None
+    what = new.tag
+    assert what is not None
     if (what.code is None) == (what.meaning is None) or (what.meaning is not None and what.codebook_id is None):
         raise InvalidParameter(
             "a tag is named by its code, or by a meaning in a codebook",
@@ -401,17 +387,15 @@ def _find_tag(registration: Registration, what: TagInput | LineInput) -> tuple[T
             )
         return code, meaning
     assert what.meaning is not None
-    with naming("tag.meaning"):
-        meaning = Meaning(*what.meaning)  # type: ignore[arg-type]
-    found = book.find_tag(meaning)
+    found = book.find_tag(what.meaning)
     if found is None:
         raise InvalidParameter(
-            f"{meaning.text} has no code in the codebook {book.name}",
+            f"{what.meaning.text} has no code in the codebook {book.name}",
             field="tag.meaning",
             limit=f"one of its {len(book.entries)} meanings",
             cure="add the meaning to the codebook first",
         )
-    return found, meaning
+    return found, what.meaning
 
 
 def _with_neighbours(connection: sa.Connection, agency_id: str, marker_id: str, spec: MagnetSpec) -> MagnetSpec:

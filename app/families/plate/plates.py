@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import sqlalchemy as sa
@@ -43,7 +43,6 @@ from app.families.surveys import (
     Commitment,
     Flags,
     MarkerRules,
-    NewMarker,
     PlannedRow,
     RowCodes,
     Rows,
@@ -74,51 +73,24 @@ from app.registry.marker_rows import CodeRow, MarkerRow
 from app.registry.spatial import distance_m
 from app.surveys.georeference import GeoreferencedSurvey
 
-# === A plate that is to be registered, as its use case knows it.
-
-
-@dataclass(frozen=True, slots=True)
-class CodeInput:
-    """The code that a plate is to have."""
-
-    scheme: PlateScheme = RECOMMENDED_SCHEME
-    digits: str | None = None
-    check_digits: int | None = None
-    registry_number: int | None = None
-    allow_mismatched_digits: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class NewPlate(NewMarker):
-    """A plate to register."""
-
-    family: ClassVar[str] = "plate"
-    position: PositionIn
-    code: CodeInput = field(default_factory=CodeInput)
-    geometry: PlateGeometry = field(default_factory=PlateGeometry)
-    heading_deg: float | None = None
-
-
 # === Schemas of requests that register plates.
 
 
-SchemeName = Literal["id", "position-robust", "position-check", "position"]
-RECOMMENDED_SCHEME_NAME: SchemeName = RECOMMENDED_SCHEME.value
 SCHEME_DESCRIPTION = (
     "`id`: a registry number; `position-robust`: the position, on 10 x 10 or 12 x 12 units; both correct wrong cells. "
     "`position-check` and `position` correct none."
 )
 
 
-class CodeIn(StrictModel):
+class CodeInput(StrictModel):
     """The plate's code; without digits they follow from the position or the registry number."""
 
-    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=SCHEME_DESCRIPTION)
+    scheme: PlateScheme = Field(RECOMMENDED_SCHEME, description=SCHEME_DESCRIPTION)
     digits: Text | None = Field(None, min_length=1, max_length=64, description="Digits to use instead of derived ones.")
     check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] | None = Field(
         None, description="For `position-check`: 1 (default) or 2."
     )
-    registry_number: Annotated[int, Field(strict=True, ge=0, lt=2**64)] | None = Field(
+    registry_number: Annotated[int, Field(strict=True, ge=0, le=2**64 - 1)] | None = Field(
         None, description="For `id`: the number; allocated if left out."
     )
     allow_mismatched_digits: Annotated[bool, Field(strict=True)] = Field(
@@ -138,8 +110,8 @@ class GeometryIn(StrictModel):
     gap_mm: Number = Field(5.0, description="Gap between units and round the border, 2 to 10. [mm]")
     thickness_mm: Number = Field(20.0, description="Thickness of the base plate, 5 to 50. [mm]")
 
-    def geometry(self, scheme: PlateScheme) -> PlateGeometry:
-        """The dimensions as the core knows them, of a plate of a scheme."""
+    def of_scheme(self, scheme: PlateScheme) -> PlateGeometry:
+        """The dimensions of a plate of a scheme, all of them."""
         with naming("geometry"):
             return recommended_geometry(
                 scheme, n=self.n, unit_mm=self.unit_mm, gap_mm=self.gap_mm, thickness_mm=self.thickness_mm
@@ -164,25 +136,8 @@ class PlateIn(Headed, MarkerIn):
 
     family: Literal["plate"] = "plate"
     position: PositionIn
-    code: CodeIn = Field(default_factory=CodeIn)
+    code: CodeInput = Field(default_factory=CodeInput)
     geometry: GeometryIn = Field(default_factory=GeometryIn)
-
-    def new(self) -> NewPlate:
-        """The plate as the use cases know it."""
-        code = self.code
-        return NewPlate(
-            position=self.position,
-            code=CodeInput(
-                PlateScheme(code.scheme),
-                code.digits,
-                code.check_digits,
-                code.registry_number,
-                code.allow_mismatched_digits,
-            ),
-            geometry=self.geometry.geometry(PlateScheme(code.scheme)),
-            heading_deg=self.heading_deg,
-            **self.shared(),
-        )
 
 
 # === Plates as clients see them.
@@ -214,6 +169,18 @@ class PlateDocument(MarkerDocument):
     family: Literal["plate"]
     code: PlateCodeDocument
     geometry: PlateGeometryDocument
+
+
+def plate_geometry_document(geometry: PlateGeometry) -> PlateGeometryDocument:
+    """Dimensions of a plate as clients see them."""
+    n, unit_mm, gap_mm = geometry.n, geometry.unit_mm, geometry.gap_mm
+    return {
+        "n": n,
+        "unit_mm": unit_mm,
+        "gap_mm": gap_mm,
+        "thickness_mm": geometry.thickness_mm,
+        "side_mm": geometry.side_mm,
+    }
 
 
 def plate_document(row: MarkerRow) -> PlateDocument:
@@ -357,7 +324,7 @@ _REDRAWS = 20
 class PlateSurveyIn(BaseModel):
     """Members of a survey's declaration that plates have."""
 
-    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=f"Of plates. {SCHEME_DESCRIPTION}")
+    scheme: PlateScheme = Field(RECOMMENDED_SCHEME, description=f"Of plates. {SCHEME_DESCRIPTION}")
     check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] | None = None
     geometry: GeometryIn = Field(default_factory=GeometryIn, description="Of plates.")
 
@@ -383,14 +350,12 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
 
     def defaults(self, declared: Mapping[str, Any]) -> PlateDefaults:
         """Scheme, check digits and dimensions."""
-        checks, scheme = declared.get("check_digits"), PlateScheme(declared.get("scheme", RECOMMENDED_SCHEME))
-        if checks is not None and scheme is not PlateScheme.POSITION_CHECK:
+        sent = PlateSurveyIn.model_validate(declared)
+        if sent.check_digits is not None and sent.scheme is not PlateScheme.POSITION_CHECK:
             raise InvalidParameter(
                 "check_digits means nothing in this scheme", field="check_digits", limit="position-check"
             )
-        with naming("geometry"):
-            geometry = recommended_geometry(scheme, **declared.get("geometry", {}))
-        return PlateDefaults(scheme, checks, geometry)
+        return PlateDefaults(sent.scheme, sent.check_digits, sent.geometry.of_scheme(sent.scheme))
 
     def code_form(self, defaults: PlateDefaults, *, compare: bool) -> CodeForm:
         """Digits of the declared size and scheme, or registry numbers; digits of any plate in comparisons."""
@@ -439,10 +404,7 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
             "scheme": codes.scheme,
             "check_digits": defaults.checks or None,
             "digits_match_position": None if defaults.scheme is PlateScheme.ID else True,
-            "n": geometry.n,
-            "unit_mm": geometry.unit_mm,
-            "gap_mm": geometry.gap_mm,
-            "thickness_mm": geometry.thickness_mm,
+            **asdict(geometry),
         }
         return Columns(len(codes.rows), same, {})
 
@@ -544,7 +506,7 @@ _ALLOCATION_TRIES = 1000
 _KIND = ("scheme", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm")
 
 
-class Plates(Family[NewPlate, PlacedPosition]):
+class Plates(Family[PlateIn, PlacedPosition]):
     """The family of plates."""
 
     name = "plate"
@@ -558,12 +520,12 @@ class Plates(Family[NewPlate, PlacedPosition]):
     document_type = PlateDocument
     detail_type = PlateDocument
 
-    def prepare(self, registration: Registration, new: NewPlate) -> PlacedPosition:
+    def prepare(self, registration: Registration, new: PlateIn) -> PlacedPosition:
         """The plate's place in WGS 84."""
         return place_input(new.position, registration.rules.crs_accuracy_m)
 
     def columns(
-        self, connection: sa.Connection, registration: Registration, new: NewPlate, prepared: PlacedPosition
+        self, connection: sa.Connection, registration: Registration, new: PlateIn, prepared: PlacedPosition
     ) -> dict[str, Any]:
         """Code, dimensions and place of a plate whose code is free.
 
@@ -574,22 +536,12 @@ class Plates(Family[NewPlate, PlacedPosition]):
         CodeTaken
             Another plate nearby carries the code.
         """
-        coded = coded_plate(
-            new.code, new.geometry.n, (prepared.lon_deg, prepared.lat_deg),
-            lambda: _allocate(connection, registration, new.geometry.n),
-        )  # fmt: skip
-        _check_free(connection, registration, coded, prepared.lon_deg, prepared.lat_deg)
-        geometry, code = new.geometry, coded.code
+        geometry, place_deg = new.geometry.of_scheme(new.code.scheme), (prepared.lon_deg, prepared.lat_deg)
+        coded = coded_plate(new.code, geometry.n, place_deg, lambda: _allocate(connection, registration, geometry.n))
+        _check_free(connection, registration, coded, *place_deg)
         return {
             "family": self.name,
-            "scheme": str(code.scheme),
-            "digits": code.digits,
-            "check_digits": code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else None,
-            "digits_match_position": coded.digits_match_position,
-            "n": geometry.n,
-            "unit_mm": geometry.unit_mm,
-            "gap_mm": geometry.gap_mm,
-            "thickness_mm": geometry.thickness_mm,
+            **_kind_columns(coded.code, geometry, coded.digits_match_position),
             "heading_deg": new.heading_deg,
             **position_columns(new.position, prepared),
         }
@@ -651,19 +603,8 @@ class Plates(Family[NewPlate, PlacedPosition]):
         for marker in markers:
             detail = marker.detail
             assert isinstance(detail, PlannedPlate)
-            code, geometry = detail.code, detail.geometry
-            checks = code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else None
-            columns = {
-                **commitment.position(marker),
-                "scheme": str(code.scheme),
-                "digits": code.digits,
-                "check_digits": checks,
-                "digits_match_position": None if code.scheme is PlateScheme.ID else True,
-                "n": geometry.n,
-                "unit_mm": geometry.unit_mm,
-                "gap_mm": geometry.gap_mm,
-                "thickness_mm": geometry.thickness_mm,
-            }
+            matches = None if detail.code.scheme is PlateScheme.ID else True
+            columns = commitment.position(marker) | _kind_columns(detail.code, detail.geometry, matches)
             yield PlannedRow(marker.number, columns)
 
     def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
@@ -672,6 +613,17 @@ class Plates(Family[NewPlate, PlacedPosition]):
 
 
 PLATE = Plates()
+
+
+def _kind_columns(code: PlateCode, geometry: PlateGeometry, matches_position: bool | None) -> dict[str, object]:
+    """Columns of a plate's code and dimensions."""
+    return {
+        "scheme": str(code.scheme),
+        "digits": code.digits,
+        "check_digits": code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else None,
+        "digits_match_position": matches_position,
+        **asdict(geometry),
+    }
 
 
 def _allocate(connection: sa.Connection, registration: Registration, n: int) -> PlateCode:

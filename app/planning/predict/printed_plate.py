@@ -17,11 +17,13 @@ import numpy.typing as npt
 
 from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.print_grade import PrintPrediction
 from app.markers.reading import PlateOutcome, PlateReading
 from app.planning.plate_view import camera_of
 from app.planning.predict.rates import (
     DAY,
     FAR_M,
+    MIN_READ_RATE,
     MIN_UNIT_PX,
     CameraView,
     PlateModel,
@@ -34,7 +36,7 @@ from app.planning.predict.rates import (
 )
 from app.planning.proof.plates import draw_drive, draw_plate
 from app.planning.proof.report import Condition
-from app.planning.rules import CameraRules, PredictionRules
+from app.planning.rules import CameraRules
 from app.simulation.backgrounds import road_background, road_photos
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, Drive, drive_over_plate
@@ -65,32 +67,11 @@ class DesignSpeed:
     speed_m_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class PrintPrediction:
-    """Predicted reading of a printed plate."""
-
-    readable_frames: float  # mean frames of a pass in which a unit is a pixel high or more
-    # `passes`, `frames`, `read`: passes and frames that were simulated with the plate's measured face, and frames that
-    # were read
-    passes: int
-    frames: int
-    read: int
-    read_alone: int  # frames that were read without the registry
-    wrong: int  # frames in which other digits were read
-    height_ratio: float  # how much higher a unit's image must be than a faultless plate's
-    # `read_rate`, `faultless_read_rate`: probability that a pass reads this plate, and a faultless one
-    read_rate: float
-    faultless_read_rate: float
-    white_reflectance: float = WHITE_REFLECTANCE  # that was assumed
-
-    @property
-    def will_be_read(self) -> bool:
-        """Whether the rate reaches the rate below which plans report a marker."""
-        return self.read_rate >= MIN_READ_RATE
-
-
-MIN_READ_RATE: float = PredictionRules().min_read_rate
-"""[1] least read rate of a plate that counts as readable. Source: default of `PredictionRules.min_read_rate`."""
+_BASIS = (
+    "{read} of {frames} frames of {passes} simulated passes by day, with the face as photographed and a white of "
+    "{white:.0%}, were read with the registry, {alone} without; the fitted model of plans turns them into the rate. No "
+    "rain, night or dirt."
+)
 
 
 def predict_print(
@@ -112,16 +93,24 @@ def predict_print(
     blur = design.speed_m_s * design.camera.exposure_s / (geometry.pitch_mm / 1000)
     weight = _posterior(model, found.passes, blur)
     rates = [read_rate_of_model(_shifted(model, shift), geometry, design.camera, design.speed_m_s) for shift in _SHIFTS]
+    frames, read, rate = len(found.frames), sum(hit for _px, hit in found.frames), float((weight * rates).sum())
+    basis = _BASIS.format(
+        read=read, alone=found.alone, frames=frames, passes=len(found.passes), white=WHITE_REFLECTANCE
+    )
     return PrintPrediction(
-        readable_frames(geometry, design.camera, design.speed_m_s),
-        len(found.passes),
-        len(found.frames),
-        sum(hit for _px, hit in found.frames),
-        found.alone,
-        found.wrong,
-        float(np.exp((weight * _SHIFTS).sum())),
-        float((weight * rates).sum()),
-        rates[0],
+        speed_kmh=round(design.speed_m_s * 3.6, 3),
+        camera=design.camera.name,
+        condition=DAY,
+        readable_frames_per_pass=round(readable_frames(geometry, design.camera, design.speed_m_s), 1),
+        simulated_frames=frames,
+        frames_read=read,
+        frames_read_alone=found.alone,
+        frames_wrong=found.wrong,
+        unit_height_ratio=round(float(np.exp((weight * _SHIFTS).sum())), 2),
+        read_rate=round(rate, 3),
+        faultless_read_rate=round(rates[0], 3),
+        will_be_read=rate >= MIN_READ_RATE,
+        basis=basis,
     )
 
 

@@ -386,32 +386,50 @@ class PassFrame:
     read_probability: float  # of reading this frame by day, in mean circumstances
 
 
+MIN_READ_RATE: float = PredictionRules().min_read_rate
+"""[1] least read rate of a plate that counts as readable. Source: default of `PredictionRules.min_read_rate`."""
+
+
+@dataclass(frozen=True, slots=True)
+class PassRate:
+    """How often a pass is predicted to read the plate."""
+
+    condition: str
+    read_rate: float
+    will_be_read: bool
+
+
 @dataclass(frozen=True, slots=True)
 class CameraPass:
-    """A pass over a plate at even speed on a flat and straight road."""
+    """A pass of a camera over a plate at even speed on a flat and straight road.
 
+    `frames` are those with units of a pixel or more, one in `listed_every`.
+    """
+
+    speed_kmh: float
     step_m: float  # [m] that the vehicle advances from frame to frame
     # `near_m`, `far_m`: [m] nearest and farthest distance at which a unit is `MIN_UNIT_PX` high or more and the plate
     # is whole in view; None where it never is
     near_m: float | None
     far_m: float | None
-    readable_frames: float  # mean number of frames of a pass between these two
+    readable_frames_per_pass: float  # mean number of frames of a pass between these two
     best_unit_px: float  # [px] greatest height of a unit's image
-    # `blur_m`, `blur_units`: distance driven during the exposure, and as a share of the pitch of the units. [m, 1]
-    blur_m: float
+    # `blur_mm`, `blur_units`: distance driven during the exposure, and as a share of the pitch of the units. [mm, 1]
+    blur_mm: float
     blur_units: float
     frames: tuple[PassFrame, ...]  # those between these two, far to near
     listed_every: int  # `frames` has one of so many
-    read_rates: dict[str, float]  # probability that a pass reads the plate, by condition
+    read_rates: tuple[PassRate, ...]
+    min_read_rate: float  # [1] least rate of a plate that counts as readable
 
 
-def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_m_s: float, left_m: float = 0.0) -> CameraPass:
+def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_kmh: float, left_m: float = 0.0) -> CameraPass:
     """Predict a pass.
 
     Parameters
     ----------
-    speed_m_s : float
-        Above 0. [m/s]
+    speed_kmh : float
+        Above 0. [km/h]
     left_m : float
         Plate's centre left of the camera's path. [m]
 
@@ -425,9 +443,9 @@ def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_m_s: float, l
     The rates are those of plans: `app.planning.predict.rates`. A single frame's probability is that of the same model
     without the spread between passes.
     """
-    if not speed_m_s > 0:
-        raise InvalidParameter(f"the speed is {speed_m_s:g} m/s", field="speed_kmh", limit="above 0")
-    camera = camera_of(rules)
+    if not speed_kmh > 0:
+        raise InvalidParameter(f"the speed is {speed_kmh:g} km/h", field="speed_kmh", limit="above 0")
+    camera, speed_m_s = camera_of(rules), speed_kmh / 3.6
     grid = np.arange(_PASS_GRID_M, FAR_M, _PASS_GRID_M)
     unit_px = unit_heights_px(camera, geometry, grid, left_m)
     in_reach = grid[unit_px >= MIN_UNIT_PX]
@@ -437,19 +455,21 @@ def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_m_s: float, l
     ahead = ahead[unit_heights_px(camera, geometry, ahead, left_m) >= MIN_UNIT_PX]
     every = max(-(-len(ahead) // MAX_FRAMES), 1)
     models = fitted_models()
+    frames_per_pass = len(in_reach) * _PASS_GRID_M / step_m if left_m else readable_frames(geometry, rules, speed_m_s)
+    rates = {name: plate_read_rate(geometry, rules, name, speed_m_s, left_m) for name in models.plates}
     return CameraPass(
+        speed_kmh=speed_kmh,
         step_m=step_m,
         near_m=float(in_reach[0]) if len(in_reach) else None,
         far_m=float(in_reach[-1]) if len(in_reach) else None,
-        readable_frames=readable_frames(geometry, rules, speed_m_s)
-        if not left_m
-        else len(in_reach) * _PASS_GRID_M / step_m,
+        readable_frames_per_pass=round(frames_per_pass, 2),
         best_unit_px=float(unit_px.max()),
-        blur_m=blur_m,
+        blur_mm=blur_m * 1000,
         blur_units=blur_m / (geometry.pitch_mm / 1000),
         frames=_frames(camera, geometry, ahead[::every][::-1], left_m, blur_m),
         listed_every=every,
-        read_rates={name: plate_read_rate(geometry, rules, name, speed_m_s, left_m) for name in models.plates},
+        read_rates=tuple(PassRate(name, round(rate, 4), rate >= MIN_READ_RATE) for name, rate in rates.items()),
+        min_read_rate=MIN_READ_RATE,
     )
 
 

@@ -11,8 +11,7 @@ import sqlalchemy as sa
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, Unavailable, WaymarkError
-from app.families.documents import WarningDocument
-from app.families.surveys import NewMarker
+from app.families.documents import MarkerIn, WarningDocument
 from app.registry.database import Database
 from app.services.access.access import Caller
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
@@ -76,7 +75,7 @@ class MarkerUpdate:
     change: MarkerChange
 
 
-Item = NewMarker | MarkerUpdate | WaymarkError
+Item = MarkerIn | MarkerUpdate | WaymarkError
 """What to do, or why the item cannot be read."""
 
 
@@ -163,7 +162,7 @@ class BulkMarkers:
 
 
 def _check_parts(items: Sequence[Item]) -> None:
-    count = sum(item.part_count for item in items if isinstance(item, NewMarker))
+    count = sum(item.part_count for item in items if isinstance(item, MarkerIn))
     if count > MAX_PARTS:
         raise InvalidParameter(
             f"the items have about {count} magnets and other markers",

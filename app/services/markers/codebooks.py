@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import datetime, timedelta
 
 from typing_extensions import TypedDict
@@ -11,7 +12,7 @@ from app.encoders.magnet import CodebookRules, allocate_codes, fitting_codes
 from app.errors import Conflict, InvalidParameter, NotFound, StaleVersion, Unavailable, WaymarkError, naming
 from app.families.magnet.documents import MeaningDocument, meaning_document
 from app.markers.magnet import InformationTag
-from app.markers.magnet_design import Codebook, Meaning, OdometerError, ReadingConditions, TagDesign, distinguishable
+from app.markers.magnet_design import Codebook, Distinguishable, Meaning, OdometerError, TagDesign, distinguishable
 from app.registry.database import Database
 from app.registry.markers import CODEBOOKS, CodebookRow, book_of
 from app.registry.resources import first_version
@@ -24,44 +25,6 @@ from app.services.ports import Clock
 # === Codebooks as they are stored and as clients see them.
 
 
-class DesignDocument(TypedDict):
-    """Design of a codebook."""
-
-    magnets: int
-    length_m: float
-    segment_m: float
-    min_gap_m: float
-
-
-class OdometerDocument(TypedDict):
-    """Errors of the vehicle's speed."""
-
-    quantum_m_s: float
-    rate_hz: float
-    drift: float
-
-
-class RulesDocument(TypedDict):
-    """Rules of a codebook."""
-
-    speed_m_s: float
-    clearance_m: float
-    odometer: OdometerDocument
-    confusion: float
-    wrong_way_safe: bool
-    survive_missing: bool
-
-
-class DistinguishableDocument(TypedDict):
-    """How many codes are read right with probability `accuracy` when all of the design are in use."""
-
-    accuracy: float
-    share: float
-    codes: int
-    mean_accuracy: float
-    worst_accuracy: float
-
-
 class FiguresDocument(TypedDict):
     """Capacities: by equation 2, with coupling, wrong-way safe, and under the rules, counted up to 200 only."""
 
@@ -70,7 +33,7 @@ class FiguresDocument(TypedDict):
     wrong_way_safe_capacity: int
     capacity_under_rules: int
     capacity_is_exact: bool
-    distinguishable: DistinguishableDocument
+    distinguishable: Distinguishable
 
 
 class CodebookSummary(TypedDict):
@@ -79,8 +42,8 @@ class CodebookSummary(TypedDict):
     id: str
     name: str
     version: int
-    design: DesignDocument
-    rules: RulesDocument
+    design: TagDesign
+    rules: CodebookRules
     figures: FiguresDocument
     entry_count: int
     created_at: datetime
@@ -111,8 +74,8 @@ class CodeDocument(TypedDict):
 class CodebookDraftDocument(TypedDict):
     """A codebook that is not made yet. `codes` are those that fit, in the order of their assignment, up to 200."""
 
-    design: DesignDocument
-    rules: RulesDocument
+    design: TagDesign
+    rules: CodebookRules
     figures: FiguresDocument
     codes: list[CodeDocument]
 
@@ -137,29 +100,14 @@ _ACCURACY = 0.99
 
 
 def rules_of(row: CodebookRow) -> CodebookRules:
-    """Rules of a book's row."""
-    rules = dict(row.rules)
-    speed, clearance, odometer = (rules.pop(name) for name in ("speed_m_s", "clearance_m", "odometer"))
-    return CodebookRules(ReadingConditions(speed, clearance, OdometerError(**odometer)), **rules)
+    """Rules of a book's row; the decoder's errors are those of its version, not the book's."""
+    return CodebookRules(**{**row.rules, "odometer": OdometerError(**row.rules["odometer"])})
 
 
 def book_columns(book: Codebook) -> dict[str, object]:
     """Columns that keep a book."""
     document = book.to_document()
     return {name: document[name] for name in ("name", "design", "entries")}
-
-
-def rules_columns(rules: CodebookRules) -> RulesDocument:
-    """Rules as plain values; the decoder's errors are those of its version, not the book's."""
-    at = rules.conditions
-    return {
-        "speed_m_s": at.speed_m_s,
-        "clearance_m": at.clearance_m,
-        "odometer": document_of(OdometerDocument, at.odometer),
-        "confusion": rules.confusion,
-        "wrong_way_safe": rules.wrong_way_safe,
-        "survive_missing": rules.survive_missing,
-    }
 
 
 def codebook_draft(design: TagDesign, rules: CodebookRules) -> CodebookDraftDocument:
@@ -173,8 +121,8 @@ def codebook_draft(design: TagDesign, rules: CodebookRules) -> CodebookDraftDocu
     with naming("rules"):
         codes = fitting_codes(design, rules, max_count=MAX_COUNTED)
     return {
-        "design": document_of(DesignDocument, design),
-        "rules": rules_columns(rules),
+        "design": design,
+        "rules": rules,
         "figures": _figures(design, rules, len(codes)),
         "codes": [{"code": tag.text, "tuple": tag.tuple_text} for tag in codes],
     }
@@ -186,14 +134,13 @@ def design_figures(design: TagDesign, rules: CodebookRules) -> FiguresDocument:
 
 
 def _figures(design: TagDesign, rules: CodebookRules, fitting: int) -> FiguresDocument:
-    apart = distinguishable(design, rules.conditions, accuracy=_ACCURACY)
     return {
         "ideal_capacity": design.ideal_capacity,
         "coupled_capacity": design.coupled_capacity,
         "wrong_way_safe_capacity": design.wrong_way_safe_capacity,
         "capacity_under_rules": fitting,
         "capacity_is_exact": fitting < MAX_COUNTED,
-        "distinguishable": document_of(DistinguishableDocument, apart, accuracy=_ACCURACY),
+        "distinguishable": distinguishable(design, rules.conditions, accuracy=_ACCURACY),
     }
 
 
@@ -218,8 +165,6 @@ def entry_document(tag: InformationTag, meaning: Meaning) -> EntryDocument:
 MAX_ENTRIES = 500
 _TRIES = 5
 
-MeaningInput = tuple[str, float | str]
-
 
 class Codebooks:
     """Use cases on codebooks. Codes are worked out before a transaction begins: that can take a second."""
@@ -235,7 +180,7 @@ class Codebooks:
         name: str,
         design: TagDesign,
         rules: CodebookRules,
-        meanings: Sequence[MeaningInput] = (),
+        meanings: Sequence[Meaning] = (),
         key: IdempotencyKey | None = None,
     ) -> tuple[CodebookDocument, bool]:
         """Store a new codebook with codes for the meanings.
@@ -265,13 +210,13 @@ class Codebooks:
             if answer.replayed:
                 return answer.response, True
             CODEBOOKS.check_name(connection, caller.agency_id, name)
-            values = {**first_version(now), **book_columns(book), "rules": rules_columns(rules), "figures": figures}
+            values = {**first_version(now), **book_columns(book), "rules": asdict(rules), "figures": figures}
             document = answer.store(codebook_document(CODEBOOKS.add(connection, caller.agency_id, values)))
             log_change(connection, caller, "codebook.made", now=now, subject=document["id"], document=document)
         return document, False
 
     def add_meanings(
-        self, caller: Caller, codebook_id: str, meanings: Sequence[MeaningInput], key: IdempotencyKey | None = None
+        self, caller: Caller, codebook_id: str, meanings: Sequence[Meaning], key: IdempotencyKey | None = None
     ) -> tuple[CodebookDocument, bool]:
         """Give codes to further meanings; codes given before stay as they are. Returns and raises as `make`.
 
@@ -334,24 +279,19 @@ class Codebooks:
                 return entry_document(tag, meaning)
         raise NotFound(f"{code[:60]!r} is not in the codebook {book.name}", field="code")
 
-    def list_entries(self, caller: Caller, codebook_id: str, meaning: MeaningInput | None) -> EntryList:
+    def list_entries(self, caller: Caller, codebook_id: str, meaning: Meaning | None) -> EntryList:
         """All entries, or the one with a meaning if there is one."""
         book = book_of(self._get(caller, codebook_id))
         if meaning is None:
             return {"items": [entry_document(*entry) for entry in book.entries]}
-        wanted = Meaning(*meaning)  # type: ignore[arg-type]
-        return {"items": [entry_document(tag, known) for tag, known in book.entries if known == wanted]}
+        return {"items": [entry_document(tag, known) for tag, known in book.entries if known == meaning]}
 
     def _get(self, caller: Caller, codebook_id: str) -> CodebookRow:
         with self._database.read() as connection:
             return CODEBOOKS.get(connection, caller.agency_id, codebook_id)
 
 
-def _allocated(book: Codebook, given: Sequence[MeaningInput], rules: CodebookRules) -> Codebook:
-    meanings = []
-    for number, (kind, value) in enumerate(given):
-        with naming(f"meanings.{number}"):
-            meanings.append(Meaning(kind, value))  # type: ignore[arg-type]
+def _allocated(book: Codebook, meanings: Sequence[Meaning], rules: CodebookRules) -> Codebook:
     try:
         with naming("rules"):
             return allocate_codes(book, meanings, rules)

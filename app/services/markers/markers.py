@@ -15,9 +15,9 @@ from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
 from app.families import FAMILIES, get_family, union_of_documents
-from app.families.documents import MarkerDocument, PositionIn, WarningDocument, place_input, position_columns
+from app.families.documents import MarkerDocument, MarkerIn, PositionIn, WarningDocument, place_input, position_columns
 from app.families.family import Family, Registration
-from app.families.surveys import MarkerRules, NewMarker
+from app.families.surveys import MarkerRules
 from app.registry import decodes as registry_observations
 from app.registry import markers as store
 from app.registry.audit import recording
@@ -138,7 +138,7 @@ class Markers:
         self._random_bits = random_bits
 
     def register(
-        self, caller: Caller, new: NewMarker, key: IdempotencyKey | None = None, warnings: WarningMode = "store"
+        self, caller: Caller, new: MarkerIn, key: IdempotencyKey | None = None, warnings: WarningMode = "store"
     ) -> tuple[MarkerDocument, bool]:
         """Store a new marker.
 
@@ -168,7 +168,7 @@ class Markers:
                 answer.store(store_new(connection))
         return answer.response, answer.replayed
 
-    def prepare_new(self, caller: Caller, new: NewMarker, now: datetime, warnings: WarningMode = "store") -> Step:
+    def prepare_new(self, caller: Caller, new: MarkerIn, now: datetime, warnings: WarningMode = "store") -> Step:
         """What takes time before a new marker is stored, and the step that then stores it.
 
         Raises

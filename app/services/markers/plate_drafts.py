@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from pydantic import ConfigDict, Field, JsonValue
 from typing_extensions import TypedDict
 
 from app.encoders.plate import (
@@ -18,21 +20,26 @@ from app.encoders.plate import (
 from app.encoders.plate.bundle import dimension_limits_mm
 from app.encoders.plate.drawing import COLOURS, INKS
 from app.encoders.plate.face import UNIT_TOLERANCE_MM, reference_text, tile_mm
-from app.families.documents import PositionIn, place_input
+from app.families.documents import POSITION_EXAMPLE, PositionIn, place_input
 from app.families.family import ArtworkProof
-from app.families.plate.plates import CodedPlate, CodeInput, PlateGeometryDocument, coded_plate
+from app.families.plate.plates import (
+    CodedPlate,
+    CodeInput,
+    GeometryIn,
+    PlateGeometryDocument,
+    coded_plate,
+    plate_geometry_document,
+)
+from app.inputs import Flag, Number, StrictModel
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, plate_capacity
-from app.planning.predict.rates import CameraPass, CameraView, PassFrame, camera_pass, check_view_size
+from app.planning.predict.rates import CameraPass, CameraView, camera_pass, check_view_size
 from app.planning.proof.report import Condition
-from app.planning.rules import CameraRules, PredictionRules
+from app.planning.rules import CameraRules
 from app.services.documents import document_of
 from app.services.markers.tasks import render_camera_view
 from app.services.ports import DecoderProcesses
 
-# === Documents of plates that are not registered: their code and dimensions, and passes of a camera over them.
-
-
-_MIN_READ_RATE = PredictionRules().min_read_rate
+# === Documents of plates that are not registered: their code and dimensions.
 
 
 class DraftCodeDocument(TypedDict):
@@ -95,42 +102,6 @@ class PlateDraftDocument(TypedDict):
     sheet: PlateSheetDocument
 
 
-class PassFrameDocument(TypedDict):
-    """A frame of a pass."""
-
-    ahead_m: float
-    unit_px: float
-    plate_width_px: float
-    plate_height_px: float
-    blur_px: float
-    read_probability: float
-
-
-class PassRateDocument(TypedDict):
-    """How often a pass is predicted to read the plate."""
-
-    condition: str
-    read_rate: float
-    will_be_read: bool
-
-
-class CameraPassDocument(TypedDict):
-    """A pass of a camera over a plate. `frames` are those with units of a pixel or more, one in `listed_every`."""
-
-    speed_kmh: float
-    step_m: float
-    near_m: float | None
-    far_m: float | None
-    readable_frames_per_pass: float
-    best_unit_px: float
-    blur_mm: float
-    blur_units: float
-    frames: list[PassFrameDocument]
-    listed_every: int
-    read_rates: list[PassRateDocument]
-    min_read_rate: float
-
-
 def plate_draft_document(
     coded: CodedPlate, order: PlateOrder, place_deg: tuple[float, float] | None, *, example: bool
 ) -> PlateDraftDocument:
@@ -153,7 +124,7 @@ def plate_draft_document(
             "correctable_erasures": capacity.correctable_erasures,
         },
         "position": None if place_deg is None else {"lon_deg": place_deg[0], "lat_deg": place_deg[1]},
-        "geometry": document_of(PlateGeometryDocument, geometry),
+        "geometry": plate_geometry_document(geometry),
         "units": _unit_rows(order),
         "dimensions": _dimensions(order),
         "colours": [
@@ -162,31 +133,6 @@ def plate_draft_document(
         ],
         "sheet": {"width_mm": width_mm, "height_mm": height_mm},
     }
-
-
-def camera_pass_document(found: CameraPass, speed_kmh: float) -> CameraPassDocument:
-    """A pass as clients see it."""
-    return {
-        "speed_kmh": speed_kmh,
-        "step_m": found.step_m,
-        "near_m": found.near_m,
-        "far_m": found.far_m,
-        "readable_frames_per_pass": round(found.readable_frames, 2),
-        "best_unit_px": found.best_unit_px,
-        "blur_mm": found.blur_m * 1000,
-        "blur_units": found.blur_units,
-        "frames": [_frame(frame) for frame in found.frames],
-        "listed_every": found.listed_every,
-        "read_rates": [
-            {"condition": name, "read_rate": round(rate, 4), "will_be_read": rate >= _MIN_READ_RATE}
-            for name, rate in found.read_rates.items()
-        ],
-        "min_read_rate": _MIN_READ_RATE,
-    }
-
-
-def _frame(frame: PassFrame) -> PassFrameDocument:
-    return document_of(PassFrameDocument, frame)
 
 
 def _unit_rows(order: PlateOrder) -> list[str]:
@@ -227,22 +173,58 @@ _KMH = 3.6  # km/h in a metre a second
 _BUSY_WAIT_S = 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class PlateDraft:
-    """A plate that is asked about."""
+_PLACE: dict[str, JsonValue] = {name: POSITION_EXAMPLE[name] for name in ("lon_deg", "lat_deg")}
+_EXAMPLES: list[JsonValue] = [
+    {"position": _PLACE, "code": {"scheme": "position-robust"}},
+    {"code": {"scheme": "id", "registry_number": 3237998146}, "geometry": {"unit_mm": 40.0}},
+]
+_PASS_EXAMPLE: dict[str, JsonValue] = {"camera": {"height_m": 1.4, "exposure_s": 0.002}, "speed_kmh": 50.0}
 
-    code: CodeInput
-    geometry: PlateGeometry
-    position: PositionIn | None
+
+class PlateDraft(StrictModel):
+    """A plate to see before it is registered."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": _EXAMPLES})
+
+    position: PositionIn | None = Field(None, description="Centre of the plate; the position schemes need it.")
+    code: CodeInput = Field(default_factory=CodeInput)
+    geometry: GeometryIn = Field(default_factory=GeometryIn)
+
+    @property
+    def plate(self) -> PlateGeometry:
+        """The dimensions of the plate, all of them."""
+        return self.geometry.of_scheme(self.code.scheme)
 
 
-@dataclass(frozen=True, slots=True)
-class Pass:
+class DraftToDraw(PlateDraft):
+    """A plate to draw before it is registered."""
+
+    heaters: Flag = Field(False, description="Heating tracks under dark units.")
+    leds: Flag = Field(False, description="Light sources under light units.")
+    resolution_dpi: Annotated[float, Field(ge=20, le=300, allow_inf_nan=False)] = Field(
+        150.0, description="Of a PNG. [1/inch]"
+    )
+
+
+class DraftToPass(PlateDraft):
     """A camera that passes a plate."""
 
-    camera: CameraRules
-    speed_kmh: float
-    left_m: float  # [m] plate's centre left of the camera's path
+    model_config = ConfigDict(json_schema_extra={"examples": [_PASS_EXAMPLE]})
+
+    camera: CameraRules = Field(default_factory=CameraRules, description="As in the rules of a plan.")
+    speed_kmh: Number = Field(60.0, ge=2.0, le=250.0, description="Speed of the vehicle. [km/h]")
+    left_m: Number = Field(0.0, ge=-5.0, le=5.0, description="Plate's centre left of the camera's path. [m]")
+
+
+class DraftToView(DraftToPass):
+    """One frame of a pass."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{**_PASS_EXAMPLE, "ahead_m": 4.0}]})
+
+    ahead_m: Number = Field(4.0, ge=0.2, le=18.0, description="From the camera to the plate's centre. [m]")
+    condition: Annotated[Condition, Field(description="Light, weather or state of the plate, as in a proof.")] = (
+        Condition.DAY
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +264,7 @@ class PlateDrafts:
         example = not coded.is_explicit and coded.code.scheme is PlateScheme.ID
         return plate_draft_document(coded, order, place_deg, example=example)
 
-    def artwork(self, draft: PlateDraft, form: ArtworkFormat, options: ArtworkOptions, dpi: float) -> DraftArtwork:
+    def artwork(self, draft: DraftToDraw, form: ArtworkFormat) -> DraftArtwork:
         """Artwork of a draft at true size, proved; raises as `document`.
 
         Raises
@@ -291,18 +273,17 @@ class PlateDrafts:
             The drawing did not read back as its own code.
         """
         _coded, order = self._order(draft)
-        drawing = encode_plate(order, options)
+        drawing = encode_plate(order, ArtworkOptions(heaters=draft.heaters, leds=draft.leds))
         proof = prove_plate(drawing, order.code, order.geometry, self._read)
-        written = write_artwork(drawing, form, dpi=dpi)
+        written = write_artwork(drawing, form, dpi=draft.resolution_dpi)
         name = f"draft-{order.code.digits}.{form}"
         return DraftArtwork(written.content, written.media_type, name, ArtworkProof(proof.digits, proof.confidence))
 
-    def camera_pass(self, draft: PlateDraft, way: Pass) -> CameraPassDocument:
+    def camera_pass(self, draft: DraftToPass) -> CameraPass:
         """Frames, blur and read rates of a pass over a draft; the code need not be known."""
-        found = camera_pass(draft.geometry, way.camera, way.speed_kmh / _KMH, way.left_m)
-        return camera_pass_document(found, way.speed_kmh)
+        return camera_pass(draft.plate, draft.camera, draft.speed_kmh, draft.left_m)
 
-    def view(self, draft: PlateDraft, way: Pass, ahead_m: float, condition: Condition) -> CameraView:
+    def view(self, draft: DraftToView) -> CameraView:
         """Picture of a draft as a camera sees it, decoded; raises as `document`.
 
         Raises
@@ -310,31 +291,30 @@ class PlateDrafts:
         Unavailable
             The decoder processes are busy.
         """
-        check_view_size(way.camera)
+        check_view_size(draft.camera)
         _coded, order = self._order(draft)
         return self._processes.run(
             render_camera_view,
             order.code,
             order.geometry,
-            way.camera,
-            way.speed_kmh / _KMH,
-            ahead_m,
-            way.left_m,
-            condition,
+            draft.camera,
+            draft.speed_kmh / _KMH,
+            draft.ahead_m,
+            draft.left_m,
+            draft.condition,
             wait_s=_BUSY_WAIT_S,
         )
 
     def _order(self, draft: PlateDraft) -> tuple[CodedPlate, PlateOrder]:
         placed = None if draft.position is None else place_input(draft.position, self._accuracy_m)
-        n = draft.geometry.n
+        plate, place_deg = draft.plate, None if placed is None else (placed.lon_deg, placed.lat_deg)
         coded = coded_plate(
-            draft.code, n, None if placed is None else (placed.lon_deg, placed.lat_deg),
-            lambda: PlateCode.from_registry_number(EXAMPLE_NUMBER, n=n),
-        )  # fmt: skip
+            draft.code, plate.n, place_deg, lambda: PlateCode.from_registry_number(EXAMPLE_NUMBER, n=plate.n)
+        )
         order = PlateOrder(
             plate_id=coded.code.digits,
             code=coded.code,
-            geometry=draft.geometry,
+            geometry=plate,
             lon_deg=None if placed is None else placed.lon_deg,
             lat_deg=None if placed is None else placed.lat_deg,
             crs="" if placed is None else reference_text(placed.realization, placed.epoch),

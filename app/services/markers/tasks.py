@@ -75,12 +75,11 @@ def grade_photo(
     design = DesignSpeed(camera, speed_kmh / _KMH)
     prediction = predict_print(grade.reflectance, grade.code, grade.geometry, design)
     document = print_grade_document(
-        grade, prediction, design, frame.header, sha256=photo.sha256, at=at, marker_id=plate.marker_id
+        grade, prediction, frame.header, sha256=photo.sha256, at=at, marker_id=plate.marker_id
     )
     if not as_pdf:
         return GradedPhoto(document)
-    decoder, basis = document["decoder"], document["prediction"]["basis"]
-    report = PrintReport(grade, prediction, design, photo.sha256, at, plate.marker_id, decoder, basis, NOTES)
+    report = PrintReport(grade, prediction, camera, photo.sha256, at, plate.marker_id, document["decoder"], NOTES)
     return GradedPhoto(document, write_print_report(report))
 
 

@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from app.families.cerpm import RadioDocument
 from app.planning.plan import LeftOut
 from app.planning.proof.report import DriveResult, MarkerProof, ReadRate
 from app.planning.radio_checks import RadioCheck, RadioPlan, Recommendation, check_radio, recommend_settings
 from app.radio.reception import RoadReception
+from app.radio.settings import RadioSettings
 from app.services.documents import document_of
 
 # === What the API returns about a radio plan.
@@ -40,16 +40,12 @@ class RoadReceptionDocument(TypedDict):
     packet_success_min: list[float | None]
 
 
-class RadioSettingsDocument(RadioDocument):
-    """Settings of a marker's radio."""
-
-
 class RecommendationDocument(TypedDict):
     """The best lawful settings that were found."""
 
     sentence: str
     reaches: Annotated[bool, Field(description="Whether the probability asked for is reached.")]
-    radio: Annotated[RadioSettingsDocument | None, Field(description="Null where nothing is lawful.")]
+    radio: Annotated[RadioSettings | None, Field(description="Null where nothing is lawful.")]
     receiver_channels: int
     read_probability: float
     battery_days: float
@@ -101,7 +97,7 @@ def _recommendation(advice: Recommendation) -> RecommendationDocument:
     return {
         "sentence": advice.sentence,
         "reaches": advice.reaches,
-        "radio": None if advice.settings is None else document_of(RadioSettingsDocument, advice.settings),
+        "radio": advice.settings,
         "receiver_channels": advice.receiver_channels,
         "read_probability": round(advice.read_probability, 6),
         "battery_days": round(advice.battery_days, 1),

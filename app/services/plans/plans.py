@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
@@ -37,7 +38,7 @@ from app.services.blobs import delete_unused, staged
 from app.services.documents import document_of, kind_of_new
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
 from app.services.jobs import RunningJob
-from app.services.markers.codebooks import book_columns, design_figures, rules_columns
+from app.services.markers.codebooks import book_columns, design_figures
 from app.services.plans.alignments import BUSY_WAIT_S, road_of
 from app.services.plans.as_built import SURVEYED
 from app.services.plans.documents import (
@@ -522,7 +523,7 @@ def _store_codebook(connection: sa.Connection, caller: Caller, plan: Plan, now: 
         values = {
             **first_version(now),
             **book_columns(book),
-            "rules": rules_columns(rules),
+            "rules": asdict(rules),
             "figures": design_figures(book.design, rules),
         }
         return CODEBOOKS.add(connection, agency_id, values).id

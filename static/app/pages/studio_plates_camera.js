@@ -15,7 +15,7 @@ import { CameraPicture } from "./studio_plates_view.js";
 import { jsonText, plateText } from "./studio_plates_draft.js";
 import { PlateForm } from "./studio_plates_plate.js";
 
-/** @typedef {import("../api/schema.js").components["schemas"]["CameraPassDocument"]} Pass */
+/** @typedef {import("../api/schema.js").components["schemas"]["CameraPass"]} Pass */
 
 const FIELDS = {
   height: "camera.height_m", fov: "camera.horizontal_fov_deg", down: "camera.depression_deg", width: "camera.width_px", rows: "camera.height_px",

@@ -113,8 +113,8 @@ function GradeOf({ grade, photo, onReport }) {
         <h2>${t("print.photo")}</h2>
         <${PhotoPreview} photo=${photo} />
         <${Facts} of=${[
-          [t("print.side"), number(grade.photo.side_px, 0, "px")], [t("print.tilt"), number(grade.photo.tilt_deg, 1, "°")],
-          [t("print.edge"), number(grade.photo.edge_mm, 2, "mm")], [t("print.reading"), textOr(`outcome.${grade.reading.outcome}`, grade.reading.outcome)],
+          [t("print.side"), number(grade.view.side_px, 0, "px")], [t("print.tilt"), number(grade.view.tilt_deg, 1, "°")],
+          [t("print.edge"), number(grade.view.edge_mm, 2, "mm")], [t("print.reading"), textOr(`outcome.${grade.reading.outcome}`, grade.reading.outcome)],
           [t("print.simulated"), t("print.simulated_frames", { read: prediction.frames_read, frames: prediction.simulated_frames })],
           [t("print.height"), t("print.height_ratio", { ratio: number(prediction.unit_height_ratio, 2) })],
         ]} />

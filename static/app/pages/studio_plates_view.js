@@ -21,7 +21,7 @@ const READINGS = /** @type {const} */ ({ alone: "good", "with-registry": "good",
 
 /**
  * @param {{ typed: import("../components/query_form.js").QueryForm, body: any, draft: import("./studio_plates_draft.js").Draft,
- *   pass: import("../api/schema.js").components["schemas"]["CameraPassDocument"] }} props
+ *   pass: import("../api/schema.js").components["schemas"]["CameraPass"] }} props
  */
 export function CameraPicture({ typed, body, draft, pass }) {
   const ahead = Number(String(typed.values.ahead_m).replace(",", ".")) || 4;

@@ -77,7 +77,7 @@ def test_a_good_print_gets_an_a_and_is_read_at_the_design_speed(workshop: httpx.
     assert document["plate"]["source"] == "declaration"
     assert document["reading"] == {"outcome": "read", "digits": CODE.digits}
     assert document["photo"]["sha256"] == hashlib.sha256(photo).hexdigest()
-    assert document["photo"]["focal_length_source"] == "assumed"
+    assert document["view"]["focal_length_source"] == "assumed"
     prediction = document["prediction"]
     assert prediction["will_be_read"]
     assert prediction["speed_kmh"] == 50.0
@@ -102,8 +102,8 @@ def test_faults_have_their_cause_and_cure(workshop: httpx.Client) -> None:
     assert below == {"modulation": "C", "reflectance-margin": "C", "axial-nonuniformity": "C"}
     assert (document["grade"], document["letter"]) == (2.0, "C")
     modulation = next(one for one in document["parameters"] if one["name"] == "modulation")
-    assert (modulation["row"], modulation["column"], modulation["unit"]) == (6, 4, "%")
-    assert modulation["thresholds"]["A"] == 50
+    assert (modulation["unit_at"], modulation["unit"]) == ([6, 4], "%")
+    assert modulation["thresholds"]["limits"][0] == 50
     assert "67" in modulation["finding"] or "%" in modulation["finding"]
     assert modulation["cure"]
 
@@ -148,7 +148,7 @@ def test_photos_are_turned_by_their_exif_and_its_focal_length_is_used(workshop: 
     refused(_send(workshop, photo, DECLARED), 422, "print-not-graded", field="photo")
     document = _send(workshop, _turned(photo, 6, 26), DECLARED).json()
     assert document["letter"] == "A", document
-    assert document["photo"]["focal_length_source"] == "exif"
+    assert document["view"]["focal_length_source"] == "exif"
     assert (document["photo"]["width_px"], document["photo"]["height_px"]) == (1600, 1200)
 
 

@@ -53,7 +53,7 @@ def test_a_good_print_has_an_a_in_everything(look: PlateLook, tilt_deg: float) -
     assert grade.view.tilt_deg == pytest.approx(tilt_deg, abs=1.0)
     contrast = parameter(grade, Name.SYMBOL_CONTRAST)
     assert contrast.value == pytest.approx(100 * (1 - 0.04 / 0.75), abs=2.0)
-    assert all(one.cure == "" for one in grade.parameters)
+    assert all(one.cure is None for one in grade.parameters)
 
 
 FAULTS: list[tuple[str, PlateLook, PrintFaults, set[Name], float]] = [
@@ -206,9 +206,9 @@ def test_photos_without_one_whole_plate_are_refused() -> None:
 
 def test_thresholds_fall_in_order_and_their_limits_belong_to_the_better_grade() -> None:
     for name, thresholds in THRESHOLDS.items():
-        ordered = sorted(thresholds.limits, reverse=thresholds.rising)
+        ordered = sorted(thresholds.limits, reverse=thresholds.higher_is_better)
         assert list(thresholds.limits) == ordered, name
         if len(set(ordered)) == 4:
             assert [thresholds.grade(limit) for limit in thresholds.limits] == [4, 3, 2, 1], name
-            beyond = -1.0 if thresholds.rising else 1e3
+            beyond = -1.0 if thresholds.higher_is_better else 1e3
             assert thresholds.grade(beyond) == 0, name

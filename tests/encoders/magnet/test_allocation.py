@@ -36,6 +36,10 @@ def notices(count: int, start: int = 0) -> list[Meaning]:
     return [Meaning(MeaningKind.NOTICE, f"notice {i}") for i in range(start, start + count)]
 
 
+def rules_at(at: ReadingConditions, confusion: float = 0.001, **flags: bool) -> CodebookRules:
+    return CodebookRules(at.speed_m_s, at.clearance_m, at.odometer, confusion, **flags)
+
+
 def book_of(design: TagDesign, count: int, rules: CodebookRules) -> Codebook:
     return allocate_codes(Codebook("book", design), notices(count), rules)
 
@@ -64,7 +68,7 @@ def mistaken(book: Codebook, at: ReadingConditions, count: int = 4000) -> float:
 
 
 def test_codes_of_a_full_book_are_not_mistaken() -> None:
-    rules = CodebookRules(HARD, confusion=0.001)
+    rules = rules_at(HARD, confusion=0.001)
     count = codebook_capacity(FINE, rules)
     assert 8 < count < FINE.coupled_capacity
     book = book_of(FINE, count, rules)
@@ -76,9 +80,9 @@ def test_codes_of_a_full_book_are_not_mistaken() -> None:
 
 
 def test_easier_conditions_and_laxer_rules_hold_more_codes() -> None:
-    strict = codebook_capacity(FINE, CodebookRules(HARD, 0.0001))
-    lax = codebook_capacity(FINE, CodebookRules(HARD, 0.01))
-    easy = codebook_capacity(FINE, CodebookRules(ReadingConditions(13.4, 0.16), 0.01))
+    strict = codebook_capacity(FINE, rules_at(HARD, 0.0001))
+    lax = codebook_capacity(FINE, rules_at(HARD, 0.01))
+    easy = codebook_capacity(FINE, rules_at(ReadingConditions(13.4, 0.16), 0.01))
     assert strict < lax < easy == FINE.coupled_capacity
 
 
@@ -94,7 +98,7 @@ def test_books_keep_their_rules(
     magnets: int, size: tuple[float, float], wrong_way: bool, clearance_m: float, asked: int
 ) -> None:
     design = TagDesign(magnets, *size)
-    rules = CodebookRules(ReadingConditions(13.4, clearance_m), 0.001, wrong_way_safe=wrong_way)
+    rules = rules_at(ReadingConditions(13.4, clearance_m), 0.001, wrong_way_safe=wrong_way)
     capacity = codebook_capacity(design, rules, max_count=asked)
     book = book_of(design, min(asked, capacity), rules)
     assert all(design.admits(tag) for tag in book.tags)
@@ -110,11 +114,11 @@ def test_books_keep_their_rules(
 def test_a_wrong_way_safe_book_takes_half_of_an_odd_design() -> None:
     design = TagDesign(3, 4.0, 0.5)
     at = ReadingConditions(13.4, 0.16)
-    assert codebook_capacity(design, CodebookRules(at)) == design.coupled_capacity == 56
-    assert codebook_capacity(design, CodebookRules(at, wrong_way_safe=True)) == design.wrong_way_safe_capacity == 28
+    assert codebook_capacity(design, rules_at(at)) == design.coupled_capacity == 56
+    assert codebook_capacity(design, rules_at(at, wrong_way_safe=True)) == design.wrong_way_safe_capacity == 28
     four = TagDesign(4, 3.0, 0.5)
     assert four.wrong_way_safe_capacity == (four.coupled_capacity - four.own_reverses) // 2
-    assert codebook_capacity(four, CodebookRules(at, wrong_way_safe=True)) == four.wrong_way_safe_capacity
+    assert codebook_capacity(four, rules_at(at, wrong_way_safe=True)) == four.wrong_way_safe_capacity
 
 
 def test_the_papers_arrows_are_named_as_a_wrong_way_pair() -> None:
@@ -124,15 +128,15 @@ def test_the_papers_arrows_are_named_as_a_wrong_way_pair() -> None:
     assert isinstance(both, InformationTag)
     book = Codebook("arrows", TagDesign(3, 2.0, 1.0), tuple(zip((straight, left, both), notices(3), strict=True)))
     at = ReadingConditions(13.4, 0.16)
-    assert list_conflicts(book, CodebookRules(at)) == []
-    assert list_conflicts(book, CodebookRules(at, wrong_way_safe=True)) == [(left, straight)]
+    assert list_conflicts(book, rules_at(at)) == []
+    assert list_conflicts(book, rules_at(at, wrong_way_safe=True)) == [(left, straight)]
 
 
 @pytest.mark.parametrize("wrong_way", [False, True])
 @pytest.mark.parametrize("design", [TagDesign(4, 3.0, 0.25), TagDesign(5, 4.0, 0.25)])
 def test_a_lost_magnet_leaves_the_code_readable(design: TagDesign, wrong_way: bool) -> None:
     at = ReadingConditions(13.4, 0.25)
-    rules = CodebookRules(at, wrong_way_safe=wrong_way, survive_missing=True)
+    rules = rules_at(at, wrong_way_safe=wrong_way, survive_missing=True)
     book = book_of(design, 12, rules)
     seen: list[tuple[int, tuple[str, ...], np.ndarray]] = []
     for i, tag in enumerate(book.tags):
@@ -145,7 +149,7 @@ def test_a_lost_magnet_leaves_the_code_readable(design: TagDesign, wrong_way: bo
         if pattern == other and i != k:
             assert np.abs(u - v).max() > 0.01  # about six standard deviations
     assert list_conflicts(book, rules) == []
-    plain = book_of(design, 12, CodebookRules(at, wrong_way_safe=wrong_way))
+    plain = book_of(design, 12, rules_at(at, wrong_way_safe=wrong_way))
     assert list_conflicts(plain, rules)  # codes given without the rule do not keep it
 
 
@@ -156,7 +160,7 @@ def test_three_magnets_do_not_survive_the_loss_of_one() -> None:
 
 
 def test_adding_keeps_what_was_given() -> None:
-    rules = CodebookRules(HARD, wrong_way_safe=True)
+    rules = rules_at(HARD, wrong_way_safe=True)
     first = book_of(FINE, 5, rules)
     second = allocate_codes(first, notices(6, start=5), rules)
     assert second.entries[:5] == first.entries
@@ -167,7 +171,7 @@ def test_adding_keeps_what_was_given() -> None:
 def test_codes_given_elsewhere_are_kept_clear_of() -> None:
     given_tag = parse_tag("NNN_4_0.05_33-47")
     assert isinstance(given_tag, InformationTag)
-    rules = CodebookRules(HARD)
+    rules = rules_at(HARD)
     book = Codebook("old", FINE, ((given_tag, Meaning(MeaningKind.ARROW, "left")),))
     full = allocate_codes(book, notices(40), rules)
     assert full.tags[0] == given_tag
@@ -175,7 +179,7 @@ def test_codes_given_elsewhere_are_kept_clear_of() -> None:
 
 
 def test_a_full_book_says_how_many_fit_and_why() -> None:
-    rules = CodebookRules(HARD, wrong_way_safe=True)
+    rules = rules_at(HARD, wrong_way_safe=True)
     fits = codebook_capacity(FINE, rules)
     book = book_of(FINE, fits - 2, rules)
     with pytest.raises(CodebookFull, match=rf"5 codes were asked for, 2 more fit beside the {fits - 2}") as caught:
@@ -199,13 +203,13 @@ def test_a_meaning_gets_one_code() -> None:
 
 def test_a_large_design_gives_a_thousand_codes() -> None:
     design = TagDesign(7, 6.0, 0.1)
-    rules = CodebookRules(ReadingConditions(20.0, 0.30), wrong_way_safe=True)
+    rules = rules_at(ReadingConditions(20.0, 0.30), wrong_way_safe=True)
     book = book_of(design, 1000, rules)
     assert len(book.entries) == 1000
     assert not {tag.reversed_wrong_way() for tag in book.tags} & set(book.tags)
 
 
 def test_a_poor_odometer_costs_codes() -> None:
-    good = CodebookRules(ReadingConditions(13.4, 0.25))
-    poor = CodebookRules(ReadingConditions(13.4, 0.25, OdometerError(drift=0.03), MagnetErrorModel()))
+    good = rules_at(ReadingConditions(13.4, 0.25))
+    poor = rules_at(ReadingConditions(13.4, 0.25, OdometerError(drift=0.03), MagnetErrorModel()))
     assert codebook_capacity(FINE, poor) < codebook_capacity(FINE, good)

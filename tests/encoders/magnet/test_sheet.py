@@ -36,8 +36,9 @@ FORMULAS = ["=1+1", "+1+1", "-1-1", "@SUM(A1)", "＝1+1"]
 def tag_sheet(
     lane: LaneLine, tag: InformationTag = TAG, name: str = "tag 7", meaning: Meaning | None = None
 ) -> DrillingSheet:
-    site = Site(13.41, 140.0, ("sedan", "van"), neighbours=(Neighbour("near", *lane.lon_lat(lane.at(90.0))),))
-    return drilling_sheet(place_tag(lane, tag, 70.0, name=name, meaning=meaning), site)
+    site = Site(13.41, 140.0, ("sedan", "van"))
+    near = Neighbour("near", *lane.lon_lat(lane.at(90.0)))
+    return drilling_sheet(place_tag(lane, tag, 70.0, name=name, meaning=meaning), site, (near,))
 
 
 def line_sheet(lane: LaneLine) -> DrillingSheet:
