@@ -10,6 +10,10 @@ from typing_extensions import ReadOnly, TypedDict
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.families.surveys import NewMarker
+from app.fields import Flag as Flag
+from app.fields import Number as Number
+from app.fields import Text as Text
+from app.fields import Whole as Whole
 from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
 from app.geodesy.systems import normalize_vertical_datum
@@ -122,12 +126,6 @@ def marker_place(row: MarkerRow) -> MarkerPlace:
 # === Schemas of requests that register or change markers: what every family shares.
 
 
-def _plain_text(text: str) -> str:
-    if "\x00" in text:
-        raise ValueError("a text holds no NUL")
-    return text
-
-
 def _vertical_datum(text: str) -> str:
     try:
         return normalize_vertical_datum(text)
@@ -136,10 +134,6 @@ def _vertical_datum(text: str) -> str:
         raise
 
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Whole = Annotated[int, Field(strict=True)]
-Flag = Annotated[bool, Field(strict=True)]
-Text = Annotated[str, AfterValidator(_plain_text)]
 Identifier = Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
 VerticalDatum = Annotated[Text, Field(min_length=1, max_length=64), AfterValidator(_vertical_datum)]
 VersionKind = Literal["as-planned", "as-built", "resurvey", "correction", "change"]

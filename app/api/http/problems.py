@@ -331,9 +331,13 @@ def validation_fault(item: Mapping[str, Any]) -> FieldError:
     limits = [text.format(context[name]) for name, text in _CONSTRAINTS.items() if name in context]
     cause = context.get("error")
     if isinstance(cause, errors.WaymarkError):
-        return FieldError(field=cause.field or path, detail=cause.message, limit=cause.limit, cure=cause.cure)
+        field = cause.field or path
+        if len(location) > 1 and not f"{field}.".startswith(f"{path}."):
+            field = f"{path}.{field}"  # a part of the request names its own field
+        return FieldError(field=field, detail=cause.message, limit=cause.limit, cure=cause.cure)
     near = f"did you mean {context['near']}? If not, " if "near" in context else ""
-    cures = {"missing": f"send {path}", "extra_forbidden": f"{near}leave {path} out"}
+    unknown = f"{near}leave {path} out"
+    cures = {"missing": f"send {path}", "extra_forbidden": unknown, "unexpected_keyword_argument": unknown}
     return FieldError(
         field=path,
         detail=f"{path}: {item['msg']}",

@@ -37,6 +37,7 @@ from app.api.http.responses import (
 from app.api.http.routes import Router
 from app.api.plans.schemas import PackageIn, PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
 from app.planning.outputs.package import MEDIA_TYPES
+from app.planning.proof import ProofReport
 from app.planning.rules import read_rules, rules_schema
 from app.registry.jobs import JobState
 from app.services.plans.documents import (
@@ -47,7 +48,6 @@ from app.services.plans.documents import (
     PlanPreview,
     PlanStatus,
     PlanVersionPage,
-    ProofDocument,
     ReadRules,
 )
 from app.services.plans.making import MAX_MARKERS, PlanMaking, PlanPreviews
@@ -400,7 +400,7 @@ def post_proof(
 
 
 @proof_router.get(
-    "/{plan_id}/proof", READERS, responses={**document_response(ProofDocument, 404), **problem_responses(404)}
+    "/{plan_id}/proof", READERS, responses={**document_response(ProofReport, 404), **problem_responses(404)}
 )
 def get_proof(plan_id: PlanId, caller: Caller, proofs: ProofService) -> Response:
     """Get the report of a plan's latest proof.

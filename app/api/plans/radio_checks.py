@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from fastapi import Response
-from pydantic import ConfigDict, Field, JsonValue
+from dataclasses import dataclass
+from typing import Annotated
 
-from app.api.http.dependencies import Caller, Number, Whole
+from fastapi import Response
+from pydantic import ConfigDict, Field, JsonValue, with_config
+
+from app.api.http.dependencies import Caller
 from app.api.http.permissions import READERS
 from app.api.http.responses import document_response, json_response
 from app.api.http.routes import Router
-from app.errors import naming
-from app.families.cerpm import RadioIn
-from app.families.documents import Flag, StrictModel
-from app.planning.radio_checks import PreviewRule, RadioPlan
-from app.radio.reception import MAX_MARKERS, Receiver, RoadMarkers
-from app.radio.settings import Battery, Region
-from app.services.plans.documents import RadioCheckDocument, check_plan
+from app.fields import Flag
+from app.planning.radio_checks import RadioCheck, RadioPlan, check_radio
 
 router = Router("/v1/radio-checks", "cerpms")
 
@@ -30,91 +28,20 @@ _EXAMPLES: list[JsonValue] = [
 ]
 
 
-class EvenRoadIn(StrictModel):
-    """A long road with a marker every so far."""
-
-    spacing_m: Number = Field(12.192, description="1 to 1,000. [m]")
-    sides: Whole = Field(2, description="Sides of the lane with markers: 1 or 2.")
-    lane_width_m: Number = Field(3.6, description="1 to 20. [m]")
-
-
-class PlacedMarkersIn(StrictModel):
-    """Where markers stand along a road."""
-
-    chainage_m: list[Number] = Field(min_length=1, max_length=MAX_MARKERS, description="Along the road. [m]")
-    offset_m: list[Number] = Field(
-        min_length=1, max_length=MAX_MARKERS, description="From the receiver's path, left positive. [m]"
-    )
-
-
-class PreviewIn(StrictModel):
-    """How far ahead a marker must have been read: by default where the vehicle stops, and at least 31 m."""
-
-    distance_m: Number | None = Field(None, description="Fixed, 1 to 2,000. [m]")
-    reaction_s: Number = Field(2.5, description="0 to 10. [s]")
-    deceleration_m_s2: Number = Field(3.4, description="0.5 to 10. [m/s2]")
-
-
-class ReceiverIn(StrictModel):
-    """The vehicle's receiver."""
-
-    channels: Whole = Field(1, description="Channels received at once.")
-    sensitivity_dbm: Number | None = Field(None, description="The chip's own if left out. [dBm]")
-    capture_db: Number | None = Field(6.0, description="By which a packet outdoes others; null for none. [dB]")
-
-
-class BatteryIn(StrictModel):
-    """The marker's battery."""
-
-    capacity_mah: Number = Field(1000.0, description="[mAh]")
-    usable_share: Number = Field(0.8, description="Of the capacity.")
-    sleep_ma: Number = Field(0.8, description="Between transmissions; of the paper's board as it is sold. [mA]")
-
-
-class RadioCheckIn(StrictModel):
+@with_config(ConfigDict(extra="forbid", json_schema_extra={"examples": _EXAMPLES}))
+@dataclass(frozen=True, slots=True)
+class RadioCheckIn(RadioPlan):
     """A plan to check."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": _EXAMPLES})
-
-    radio: RadioIn = Field(default_factory=RadioIn)
-    region: Region = Region.US915
-    road: EvenRoadIn = Field(default_factory=lambda: EvenRoadIn())
-    markers: PlacedMarkersIn | None = Field(None, description="In place of `road`: where each is.")
-    design_speed_m_s: Number = Field(13.4, description="0.5 to 70. [m/s]")
-    preview: PreviewIn = Field(default_factory=lambda: PreviewIn())
-    receiver: ReceiverIn = Field(default_factory=lambda: ReceiverIn())
-    battery: BatteryIn = Field(default_factory=lambda: BatteryIn())
-    min_probability: Number = Field(0.99, description="That a marker is read in time, 0.5 to 0.9999.")
-    min_battery_days: Number = Field(365.0, description="0 to 36,500. [day]")
-    recommend: Flag = Field(False, description="Also search for lawful settings that reach it; takes a second or two.")
-
-    def plan(self) -> RadioPlan:
-        """The plan as `app.planning` defines it."""
-        settings = self.radio.settings()
-        placed = self.markers
-        markers = None if placed is None else RoadMarkers(placed.chainage_m, placed.offset_m)  # type: ignore[arg-type]
-        with naming("receiver"):
-            receiver = Receiver(**self.receiver.model_dump())
-        with naming("battery"):
-            battery = Battery(**self.battery.model_dump())
-        return RadioPlan(
-            settings,
-            self.region,
-            **self.road.model_dump(),
-            markers=markers,
-            design_speed_m_s=self.design_speed_m_s,
-            preview=PreviewRule(**self.preview.model_dump()),
-            receiver=receiver,
-            battery=battery,
-            min_probability=self.min_probability,
-            min_battery_days=self.min_battery_days,
-        )
+    recommend: Annotated[
+        Flag, Field(description="Also search for lawful settings that reach it; takes a second or two.")
+    ] = False
 
 
-@router.post("", READERS, expensive=True, responses=document_response(RadioCheckDocument))
+@router.post("", READERS, expensive=True, responses=document_response(RadioCheck))
 def post_radio_check(wanted: RadioCheckIn, caller: Caller) -> Response:
     """Check the radios of CERPMs on a road.
 
     Law, link, collisions, reading in time, battery. Nothing is stored.
     """
-    return json_response(check_plan(wanted.plan(), recommend=wanted.recommend))
+    return json_response(check_radio(wanted, recommend=wanted.recommend))

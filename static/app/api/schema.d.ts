@@ -2565,7 +2565,7 @@ export interface components {
             declaration: {
                 [key: string]: unknown;
             };
-            events: components["schemas"]["EventSummary"][];
+            events: components["schemas"]["RoadEvent"][];
             extent_deg: number[];
             format: string;
             id: string;
@@ -2709,11 +2709,16 @@ export interface components {
             kind: "pmtiles" | "raster";
             url: string;
         };
-        BatteryIn: {
+        Battery: {
+            /** @default 40 */
+            awake_ma?: number;
+            /** @default 0.01 */
+            awake_s?: number;
             /** @default 1000 */
             capacity_mah?: number;
             /** @default 0.8 */
             sleep_ma?: number;
+            transmit_ma?: number | null;
             /** @default 0.8 */
             usable_share?: number;
         };
@@ -3053,9 +3058,9 @@ export interface components {
             version: number;
         };
         CheckComparison: {
-            built: components["schemas"]["FindingDocument"] | null;
+            built: components["schemas"]["PlanFinding"] | null;
             name: string;
-            planned: components["schemas"]["FindingDocument"] | null;
+            planned: components["schemas"]["PlanFinding"] | null;
             verdict_changed: boolean;
         };
         CheckDocument: {
@@ -3075,7 +3080,7 @@ export interface components {
             name: string;
             relation: string;
             unit: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
         ClockDocument: {
             clock: string;
@@ -3232,7 +3237,7 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             currency: string;
-            findings: components["schemas"]["FindingDocument"][];
+            findings: components["schemas"]["PlanFinding"][];
             id: string;
             lane_length_m: number;
             left_out: components["schemas"]["LeftOut"][];
@@ -3248,7 +3253,7 @@ export interface components {
             uncommitted: number;
             /** Format: date-time */
             updated_at: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
             version: number;
         };
         ComparisonDocument: {
@@ -3741,8 +3746,7 @@ export interface components {
             path_worst_at_m: number | null;
             path_worst_m: number | null;
             read: number;
-            /** @default [] */
-            refusals?: string[];
+            refusals: string[];
             wrong: number;
         };
         DriveStatistics: {
@@ -3785,7 +3789,7 @@ export interface components {
             low: number;
             value: number;
         };
-        EvenRoadIn: {
+        EvenRoad: {
             /** @default 3.6 */
             lane_width_m?: number;
             /** @default 2 */
@@ -3803,14 +3807,10 @@ export interface components {
             kind: string;
             subject_id: string | null;
         };
+        /** @enum {string} */
+        EventKind: "stop_line" | "junction" | "crossing" | "arrow" | "speed_limit" | "curve";
         EventPage: {
             items: components["schemas"]["EventDocument"][];
-        };
-        EventSummary: {
-            chainage_m: number;
-            kind: string;
-            lane: string;
-            value: number | string | null;
         };
         ExplainedDocument: {
             field: string;
@@ -3968,20 +3968,6 @@ export interface components {
             distinguishable: components["schemas"]["DistinguishableDocument"];
             ideal_capacity: number;
             wrong_way_safe_capacity: number;
-        };
-        FindingDocument: {
-            figure: number;
-            lane: string | null;
-            lat_deg: number | null;
-            limit: number;
-            lon_deg: number | null;
-            name: string;
-            relation: string;
-            sentence: string;
-            source: string;
-            station_m: number | null;
-            unit: string;
-            verdict: string;
         };
         FixDocument: {
             covariance: number[][];
@@ -4463,8 +4449,7 @@ export interface components {
             chainage_m: number;
             family: string;
             lane: string;
-            /** @default null */
-            moved_m?: number | null;
+            moved_m: number | null;
             reason: string;
         };
         LeftOutEntryDocument: {
@@ -4512,6 +4497,18 @@ export interface components {
             templated?: boolean;
             title?: string;
             type: string;
+        };
+        LinkModel: {
+            /** @default 20 */
+            at_power_dbm?: number;
+            /** @default 2.0420201802690747 */
+            exponent?: number;
+            /** @default 4 */
+            fading_db?: number;
+            /** @default -108 */
+            near_dbm?: number;
+            /** @default 50 */
+            near_m?: number;
         };
         LocalGridDocument: {
             control_points: components["schemas"]["ControlResidual"][];
@@ -5046,10 +5043,6 @@ export interface components {
         };
         /** @enum {string} */
         PayloadFormat: "bin" | "hex" | "json";
-        PlacedMarkersIn: {
-            chainage_m: number[];
-            offset_m: number[];
-        };
         PlaceDocument: {
             chainage_m: number;
             exact: boolean;
@@ -5079,7 +5072,7 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             currency: string;
-            findings: components["schemas"]["FindingDocument"][];
+            findings: components["schemas"]["PlanFinding"][];
             id: string;
             lane_length_m: number;
             left_out: components["schemas"]["LeftOut"][];
@@ -5093,8 +5086,23 @@ export interface components {
             status: "draft" | "checked" | "proved" | "approved" | "committed" | "built" | "surveyed";
             /** Format: date-time */
             updated_at: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
             version: number;
+        };
+        PlanFinding: {
+            figure: number;
+            lane: string | null;
+            lat_deg: number | null;
+            limit: number;
+            lon_deg: number | null;
+            name: string;
+            /** @enum {string} */
+            relation: ">=" | "<=";
+            sentence: string;
+            source: string;
+            station_m: number | null;
+            unit: string;
+            verdict: components["schemas"]["Verdict"];
         };
         PlanIn: {
             alignment_id: string;
@@ -5176,7 +5184,7 @@ export interface components {
             status: "draft" | "checked" | "proved" | "approved" | "committed" | "built" | "surveyed";
             /** Format: date-time */
             updated_at: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
             version: number;
         };
         PlanPage: {
@@ -5197,12 +5205,12 @@ export interface components {
                 [key: string]: number;
             };
             currency: string;
-            findings: components["schemas"]["FindingDocument"][];
+            findings: components["schemas"]["PlanFinding"][];
             lane_length_m: number;
             left_out: components["schemas"]["LeftOut"][];
             left_out_count: number;
             markers: components["schemas"]["PreviewedMarker"][];
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
         PlanPreviewIn: {
             alignment_id: string;
@@ -5442,7 +5450,7 @@ export interface components {
             purpose: string;
             station_m: number;
         };
-        PreviewIn: {
+        PreviewRule: {
             /** @default 3.4 */
             deceleration_m_s2?: number;
             distance_m?: number | null;
@@ -5566,7 +5574,7 @@ export interface components {
         };
         ProfileEvent: {
             chainage_m: number;
-            kind: string;
+            kind: components["schemas"]["EventKind"];
             lane: string;
             lat_deg: number;
             lon_deg: number;
@@ -5586,18 +5594,6 @@ export interface components {
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
             /** @default false */
             with_keys?: boolean;
-        };
-        ProofDocument: {
-            complete: boolean;
-            drives: components["schemas"]["DriveResult"][];
-            format: string;
-            markers: components["schemas"]["MarkerProof"][];
-            note: string;
-            plan: string;
-            rates: components["schemas"]["ReadRate"][];
-            terms: components["schemas"]["ProofTermsDocument"];
-            weak: number[];
-            wrong: components["schemas"]["WrongReadingDocument"][];
         };
         ProofIn: {
             cameras?: string[] | null;
@@ -5626,6 +5622,18 @@ export interface components {
             /** @default 0.9 */
             weak_below?: number;
         };
+        ProofReport: {
+            complete: boolean;
+            drives: components["schemas"]["DriveResult"][];
+            format: string;
+            markers: components["schemas"]["MarkerProof"][];
+            note: string;
+            plan: string;
+            rates: components["schemas"]["ReadRate"][];
+            terms: components["schemas"]["ProofTerms"];
+            weak: number[];
+            wrong: components["schemas"]["WrongInDrive"][];
+        };
         ProofSummary: {
             /** Format: date-time */
             at: string;
@@ -5633,13 +5641,13 @@ export interface components {
             markers: number;
             passed: boolean;
             rates: components["schemas"]["ReadRate"][];
-            terms: components["schemas"]["ProofTermsDocument"];
+            terms: components["schemas"]["ProofTerms"];
             units: number;
             weak: number;
             weak_markers: components["schemas"]["WeakMarker"][];
             wrong: number;
         };
-        ProofTermsDocument: {
+        ProofTerms: {
             cameras: string[] | null;
             clearance_m: number;
             conditions: string[];
@@ -5671,35 +5679,36 @@ export interface components {
             damage_reports: boolean;
             fields: ("code" | "agency" | "status" | "revision" | "road" | "measure")[];
         };
-        RadioCheckDocument: {
+        RadioCheck: {
             battery_days: number;
-            checks: components["schemas"]["RadioFindingDocument"][];
+            checks: components["schemas"]["RadioFinding"][];
             packet_success: number;
             preview_m: number;
             range_m: number;
             read_probability: number;
-            recommendation: components["schemas"]["RecommendationDocument"] | null;
-            road: components["schemas"]["RoadReceptionDocument"];
+            recommendation: components["schemas"]["Recommendation"] | null;
+            road: components["schemas"]["RoadReception"];
             time_on_air_s: number;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
         RadioCheckIn: {
-            battery?: components["schemas"]["BatteryIn"];
+            battery?: components["schemas"]["Battery"];
             /** @default 13.4 */
             design_speed_m_s?: number;
-            markers?: components["schemas"]["PlacedMarkersIn"] | null;
+            link?: components["schemas"]["LinkModel"];
+            markers?: components["schemas"]["RoadMarkers"] | null;
             /** @default 365 */
             min_battery_days?: number;
             /** @default 0.99 */
             min_probability?: number;
-            preview?: components["schemas"]["PreviewIn"];
-            radio?: components["schemas"]["RadioIn"];
-            receiver?: components["schemas"]["ReceiverIn"];
+            preview?: components["schemas"]["PreviewRule"];
+            radio?: components["schemas"]["RadioSettings"];
+            receiver?: components["schemas"]["Receiver"];
             /** @default false */
             recommend?: boolean;
             /** @default US915 */
             region?: components["schemas"]["Region"];
-            road?: components["schemas"]["EvenRoadIn"];
+            road?: components["schemas"]["EvenRoad"];
         };
         RadioDocument: {
             antenna_gain_dbi: number;
@@ -5717,7 +5726,7 @@ export interface components {
             preamble_symbols: number;
             spreading_factor: number;
         };
-        RadioFindingDocument: {
+        RadioFinding: {
             figure: number;
             limit: number;
             name: string;
@@ -5726,7 +5735,7 @@ export interface components {
             sentence: string;
             source: string;
             unit: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
         RadioIn: {
             /** @default 2.15 */
@@ -5758,21 +5767,35 @@ export interface components {
             /** @default 7 */
             spreading_factor?: number;
         };
-        RadioSettingsDocument: {
-            antenna_gain_dbi: number;
-            bandwidth_hz: number;
-            channels: number;
-            coding_rate: number;
-            crc: boolean;
-            explicit_header: boolean;
-            frequency_hz: number;
-            hopping: boolean;
-            interval_s: number;
-            jitter_share: number;
-            lorawan: boolean;
-            power_dbm: number;
-            preamble_symbols: number;
-            spreading_factor: number;
+        RadioSettings: {
+            /** @default 2.15 */
+            antenna_gain_dbi?: number;
+            /** @default 500000 */
+            bandwidth_hz?: number;
+            /** @default 1 */
+            channels?: number;
+            /** @default 5 */
+            coding_rate?: number;
+            /** @default true */
+            crc?: boolean;
+            /** @default true */
+            explicit_header?: boolean;
+            /** @default 915000000 */
+            frequency_hz?: number;
+            /** @default false */
+            hopping?: boolean;
+            /** @default 1.6 */
+            interval_s?: number;
+            /** @default 0.2 */
+            jitter_share?: number;
+            /** @default false */
+            lorawan?: boolean;
+            /** @default 20 */
+            power_dbm?: number;
+            /** @default 8 */
+            preamble_symbols?: number;
+            /** @default 7 */
+            spreading_factor?: number;
         };
         ReadGeometryDocument: {
             gap_mm: number;
@@ -5824,11 +5847,13 @@ export interface components {
             /** @constant */
             status: "received";
         };
-        ReceiverIn: {
+        Receiver: {
             /** @default 6 */
             capture_db?: number | null;
             /** @default 1 */
             channels?: number;
+            /** @default false */
+            relocks?: boolean;
             sensitivity_dbm?: number | null;
         };
         ReceiverPositions: {
@@ -5837,9 +5862,9 @@ export interface components {
             lon_deg: number[];
             time_s: number[];
         };
-        RecommendationDocument: {
+        Recommendation: {
             battery_days: number;
-            radio: components["schemas"]["RadioSettingsDocument"] | null;
+            radio: components["schemas"]["RadioSettings"] | null;
             reaches: boolean;
             read_probability: number;
             receiver_channels: number;
@@ -6002,6 +6027,12 @@ export interface components {
             updated_at: string;
             version: number;
         };
+        RoadEvent: {
+            chainage_m: number;
+            kind: components["schemas"]["EventKind"];
+            lane: string;
+            value: number | string | null;
+        };
         RoadGeometry: {
             coordinates: number[][] | number[][][];
             /** @enum {string} */
@@ -6055,6 +6086,10 @@ export interface components {
             sections: components["schemas"]["Section"][];
             version: number;
         };
+        RoadMarkers: {
+            chainage_m: number[];
+            offset_m: number[];
+        };
         RoadPage: {
             items: components["schemas"]["RoadSummary"][];
         };
@@ -6085,7 +6120,7 @@ export interface components {
             sections: components["schemas"]["Section"][];
             version: number;
         };
-        RoadReceptionDocument: {
+        RoadReception: {
             markers_in_range: number[];
             packet_success_mean: (number | null)[];
             packet_success_min: (number | null)[];
@@ -6725,6 +6760,8 @@ export interface components {
         VehicleVersionPage: {
             items: components["schemas"]["VehicleVersionDocument"][];
         };
+        /** @enum {string} */
+        Verdict: "ok" | "warn" | "fail";
         VerificationDocument: {
             /** Format: date-time */
             created_at: string;
@@ -6797,7 +6834,7 @@ export interface components {
         WebhookList: {
             items: components["schemas"]["WebhookDocument"][];
         };
-        WrongReadingDocument: {
+        WrongInDrive: {
             drive: number;
             marker: number;
             text: string;
@@ -10437,7 +10474,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["ProofDocument"];
+                    "application/json": components["schemas"]["ProofReport"];
                 };
             };
         };
@@ -10729,7 +10766,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["RadioCheckDocument"];
+                    "application/json": components["schemas"]["RadioCheck"];
                 };
             };
         };
