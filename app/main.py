@@ -70,7 +70,6 @@ ROUTERS = (
     plans.router,
     plans.proof_router,
     plans.package_router,
-    plans.job_router,
     jobs.router,
     jobs.file_router,
     jobs.webhook_router,

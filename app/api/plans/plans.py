@@ -35,11 +35,11 @@ from app.api.http.responses import (
     wants_job,
 )
 from app.api.http.routes import Router
+from app.api.jobs import queued_job
 from app.api.plans.schemas import PackageIn, PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
 from app.planning.outputs.package import MEDIA_TYPES
 from app.planning.proof import ProofReport
 from app.planning.rules import read_rules, rules_schema
-from app.registry.jobs import JobState
 from app.services.plans.documents import (
     AsBuiltDocument,
     CommittedPlan,
@@ -53,7 +53,8 @@ from app.services.plans.documents import (
 from app.services.plans.making import MAX_MARKERS, PlanMaking, PlanPreviews
 from app.services.plans.packages import Packages
 from app.services.plans.plans import Plans
-from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, PlanJobDocument, PlanJobPage, PlanJobs, Proofs
+from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, Proofs
+from app.services.progress import JobDocument, PackageJob, PlanJob, ProofJob
 
 # === /v1/plan-rules and /v1/plan-previews: rules of plans, and what they would place.
 
@@ -110,51 +111,6 @@ def _schema() -> bytes:
     return orjson.dumps(rules_schema())
 
 
-# === /v1/plan-jobs: progress, results and cancelling of jobs about plans.
-
-
-job_router = Router("/v1/plan-jobs", "plans")
-
-JobId = Annotated[Identifier, Path(description="Id of the job.")]
-JobService = Annotated[PlanJobs, use_case(lambda cases: cases.plan_jobs)]
-
-
-def queued_response(job: PlanJobDocument, replayed: bool) -> Response:
-    """202 Accepted for a job that was queued."""
-    response = created_response(job, replayed, path="/v1/plan-jobs", status=202)
-    response.headers["Retry-After"] = "1"
-    return response
-
-
-@job_router.get("", READERS, responses=document_response(PlanJobPage))
-def list_plan_jobs(
-    request: Request,
-    caller: Caller,
-    jobs: JobService,
-    plan_id: Annotated[Identifier | None, Query(description="Jobs about this plan.")] = None,
-    state: JobState | None = None,
-    limit: PageSize = 100,
-    after: LastId = None,
-) -> Response:
-    """List jobs about plans.
-
-    Without their results, newest first.
-    """
-    page, last = jobs.page(caller, plan_id=plan_id, state=state, before=after, limit=limit)
-    return page_response(request, page, after=last)
-
-
-@job_router.get("/{job_id}", READERS, responses=document_response(PlanJobDocument, 404))
-def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
-    """Get a job about a plan.
-
-    With its progress, or its result.
-    """
-    document = jobs.get(caller, job_id)
-    waiting = document["state"] in ("queued", "running")
-    return json_response(document, headers={"Retry-After": "1"} if waiting else None)
-
-
 # === /v1/plans.
 
 
@@ -173,7 +129,7 @@ Service = Annotated[Plans, use_case(lambda cases: cases.plans)]
     status_code=201,
     responses={
         201: {"model": PlanDocument, "description": "Made"},
-        202: {"model": PlanJobDocument, "description": "Queued; Location leads to its progress and to the plan"},
+        202: {"model": PlanJob, "description": "Queued; Location leads to its progress and to the plan"},
         **problem_responses(404, 409),
     },
 )
@@ -193,10 +149,10 @@ def post_plan(
     """
     asked = (caller, wanted.name, wanted.alignment_id, wanted.rules, idempotency)
     as_job = wants_job(prefer) or making.is_long(caller, wanted.alignment_id)
-    document: PlanDocument | PlanJobDocument
+    document: PlanDocument | JobDocument
     document, replayed = making.request(*asked) if as_job else plans.make(*asked)
     if "attempts" in document:  # a repeated request gets the first response, whichever it was
-        return queued_response(cast("PlanJobDocument", document), replayed)
+        return queued_job(cast("JobDocument", document), replayed)
     return created_response(document, replayed, path="/v1/plans")
 
 
@@ -329,9 +285,7 @@ PackageService = Annotated[Packages, use_case(lambda cases: cases.packages)]
     "/{plan_id}/package",
     PLANNERS,
     status_code=202,
-    responses=document_response(
-        PlanJobDocument, 404, 409, status=202, description="Queued; Location leads to its progress"
-    ),
+    responses=document_response(PackageJob, 404, 409, status=202, description="Queued; Location leads to its progress"),
 )
 def post_package(
     plan_id: PlanId, wanted: PackageIn, caller: Caller, packages: PackageService, idempotency: Idempotency
@@ -342,7 +296,7 @@ def post_package(
 
     Every plate is read back from its drawing first. The package replaces the plan's earlier one.
     """
-    return queued_response(*packages.request(caller, plan_id, wanted.options(), idempotency))
+    return queued_job(*packages.request(caller, plan_id, wanted.options(), idempotency))
 
 
 @package_router.get(
@@ -382,7 +336,7 @@ ProofService = Annotated[Proofs, use_case(lambda cases: cases.proofs)]
     PLANNERS,
     status_code=202,
     responses=document_response(
-        PlanJobDocument, 404, 409, 412, 428, status=202, description="Queued; Location leads to its progress"
+        ProofJob, 404, 409, 412, 428, status=202, description="Queued; Location leads to its progress"
     ),
 )
 def post_proof(
@@ -396,7 +350,7 @@ def post_proof(
     are listed and change nothing. The proof belongs to the markers as they are placed now: if other rules place them
     again in the meantime, the plan is not proved.
     """
-    return queued_response(*proofs.request(caller, plan_id, terms, version, idempotency))
+    return queued_job(*proofs.request(caller, plan_id, terms, version, idempotency))
 
 
 @proof_router.get(

@@ -245,6 +245,34 @@ class PlanDocument(PlanSummary):
     updated_at: datetime
 
 
+class MadePlanResult(TypedDict):
+    """A plan that a job has made."""
+
+    plan_version: int
+
+
+class ProofResult(TypedDict):
+    """A proof in short; the report is a resource of the plan."""
+
+    plan_version: int
+    """Version of the plan that was proved."""
+    outdated: bool
+    """The plan was changed while it was proved: the result is not its proof."""
+    passed: bool
+    weak: int
+    wrong: int
+
+
+class PackageResult(TypedDict):
+    """A package in short."""
+
+    plan_version: int
+    """Version of the plan that was packed."""
+    size_bytes: int
+    sha256: str
+    files: int
+
+
 class PlanPage(TypedDict):
     """A page of plans."""
 

@@ -29,9 +29,10 @@ from app.services.blobs import delete_unused, staged
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S
-from app.services.plans.proofs import WAIT_S, PlanJobDocument, check_only_one, plan_job_document, results_in_order
+from app.services.plans.proofs import WAIT_S, check_only_one, results_in_order
 from app.services.plans.tasks import check_package, list_package_parts, write_package_manifest, write_package_part
 from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue
+from app.services.progress import JobDocument, job_document
 
 _FOLDER = "packages"
 
@@ -65,7 +66,7 @@ class Packages:
 
     def request(
         self, caller: Caller, plan_id: str, options: Mapping[str, object], key: IdempotencyKey | None = None
-    ) -> tuple[PlanJobDocument, bool]:
+    ) -> tuple[JobDocument, bool]:
         """Queue the package of a plan as it is; returns the job and whether the request had been made before.
 
         Parameters
@@ -102,7 +103,7 @@ class Packages:
                 return answer.response, True
             check_only_one(connection, agency_id, JobKind.PACKAGE, plan_id)
             store.add_job(connection, job)
-            response = answer.store(plan_job_document(job))
+            response = answer.store(job_document(job, now))
         self._queue.submit(job.id, job.agency_id, JobKind.PACKAGE)
         return response, False
 

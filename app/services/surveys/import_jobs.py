@@ -16,13 +16,8 @@ from app.services.blobs import staged
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, JobQueue
-from app.services.surveys.import_report import (
-    ImportJobDocument,
-    ImportJobPage,
-    import_input,
-    import_job_document,
-    import_job_summary,
-)
+from app.services.progress import JobDocument, job_document
+from app.services.surveys.import_report import import_input
 from app.services.surveys.imports import SETTLED, Imports
 
 IMMEDIATE_BYTES = 4 * 1024**2
@@ -60,7 +55,7 @@ class ImportJobs:
 
     def submit(
         self, caller: Caller, declared: Mapping[str, Any], file: SpooledFile, key: IdempotencyKey | None
-    ) -> tuple[ImportJobDocument, bool]:
+    ) -> tuple[JobDocument, bool]:
         """Store the file and queue its import.
 
         Parameters
@@ -70,7 +65,7 @@ class ImportJobs:
 
         Returns
         -------
-        job : ImportJobDocument
+        job : JobDocument
         replayed : bool
             The request had been made before under the same Idempotency-Key.
 
@@ -91,32 +86,10 @@ class ImportJobs:
                 if answer.replayed:
                     return answer.response, True
                 store.add_job(connection, job)
-                document = answer.store(import_job_document(job))
+                document = answer.store(job_document(job, now))
             stage.keep()
         self._queue.submit(job.id, job.agency_id, JobKind.IMPORT)
         return document, False
-
-    def get(self, caller: Caller, import_id: str) -> ImportJobDocument:
-        """A job with its report, once there is one.
-
-        Raises
-        ------
-        NotFound
-            There is none with this id, or it belongs to another agency.
-        """
-        with self._database.read() as connection:
-            return import_job_document(store.get_job(connection, caller.agency_id, JobKind.IMPORT, import_id))
-
-    def page(
-        self, caller: Caller, *, state: str | None = None, before: str | None = None, limit: int = 100
-    ) -> tuple[ImportJobPage, str | None]:
-        """A page of jobs without their reports, newest first, and the id to continue before."""
-        with self._database.read() as connection:
-            rows = store.list_jobs(
-                connection, caller.agency_id, JobKind.IMPORT, state=state, before=before, limit=limit + 1
-            )
-        page = ImportJobPage(items=[import_job_summary(row) for row in rows[:limit]])
-        return page, rows[limit - 1].id if len(rows) > limit else None
 
     def run(self, job: RunningJob) -> None:
         """Import a survey that was queued; the handler of jobs of the kind `JobKind.IMPORT`."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Annotated, Any, Final, Literal, cast
 
 import numpy as np
@@ -19,9 +18,8 @@ from app.formats.surveys.declaration import ControlPoint, ImportDeclaration, Loc
 from app.formats.surveys.table import Change, Detected, Fault, Severity
 from app.plots.track import draw_residuals
 from app.registry.conditions import grade_columns
-from app.registry.jobs import JobRow, JobState
 from app.registry.marker_rows import MarkerRow
-from app.services.documents import ErrorDocument, cut_text, document_of
+from app.services.documents import cut_text, document_of
 from app.services.markers.plausibility import AccuracyDocument, accuracy_document
 from app.surveys.comparison import Comparison, ComparisonFigures
 from app.surveys.georeference import GeoreferencedSurvey, LocalGridDocument
@@ -116,48 +114,6 @@ class ImportReport(TypedDict):
     faults: Annotated[list[FaultDocument], Field(description="The first thousand, refusals first.")]
     faults_left_out: int
     listed: Annotated[list[SurveyRow], Field(description="As many rows as `list_rows` asks for.")]
-
-
-class ImportJobLinks(TypedDict):
-    """Where to read the job again."""
-
-    self: str
-
-
-class ImportJobSummary(TypedDict):
-    """An import that is or was a job, without its report."""
-
-    id: str
-    state: JobState
-    progress: Annotated[float, Field(description="0 to 1.")]
-    attempts: int
-    cancel_requested: Annotated[bool, Field(description="A running import stops before it stores anything.")]
-    created_at: datetime
-    finished_at: datetime | None
-    error: Annotated[ErrorDocument | None, Field(description="Why the file or its declaration cannot be used.")]
-    links: ImportJobLinks
-
-
-class ImportJobDocument(ImportJobSummary):
-    """An import that is or was a job."""
-
-    report: ImportReport | None
-
-
-class ImportJobPage(TypedDict):
-    """A page of imports, newest first; the Link header leads to the next one."""
-
-    items: list[ImportJobSummary]
-
-
-def import_job_document(job: JobRow) -> ImportJobDocument:
-    """An import with its report, once there is one."""
-    return {**import_job_summary(job), "report": cast("ImportReport | None", job.result)}
-
-
-def import_job_summary(job: JobRow) -> ImportJobSummary:
-    """An import without its report."""
-    return document_of(ImportJobSummary, job, links={"self": f"/v1/imports/{job.id}"})
 
 
 def comparison_document(

@@ -573,23 +573,6 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/audit/verifications/{verification_id}": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** Get a verification of the audit log */
-        get: operations["get_verification"];
-        put?: never;
-        post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
     "/v1/calibration-boards/board.{form}": {
         parameters: {
             query?: never;
@@ -1149,28 +1132,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List the imports of an agency that are or were jobs */
-        get: operations["list_imports"];
+        get?: never;
         put?: never;
         /** Import a survey */
         post: operations["post_import"];
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/imports/{import_id}": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** Get an import that was queued */
-        get: operations["get_import"];
-        put?: never;
-        post?: never;
         delete?: never;
         options?: never;
         head?: never;
@@ -1649,40 +1614,6 @@ export interface paths {
         };
         /** Get the settings of the web pages */
         get: operations["get_page_settings"];
-        put?: never;
-        post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/plan-jobs": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** List jobs about plans */
-        get: operations["list_plan_jobs"];
-        put?: never;
-        post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/plan-jobs/{job_id}": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** Get a job about a plan */
-        get: operations["get_plan_job"];
         put?: never;
         post?: never;
         delete?: never;
@@ -2683,7 +2614,7 @@ export interface components {
             versions: number;
             who: string;
         };
-        AuditFaultDocument: {
+        AuditFault: {
             what: string;
             where: string;
         };
@@ -4207,38 +4138,30 @@ export interface components {
             /** @enum {string} */
             polarity: "N" | "S";
         };
-        ImportJobDocument: {
+        ImportJob: {
             attempts: number;
             cancel_requested: boolean;
             /** Format: date-time */
             created_at: string;
+            dead_letter: boolean;
+            done: number | null;
             error: components["schemas"]["ErrorDocument"] | null;
             finished_at: string | null;
             id: string;
-            links: components["schemas"]["ImportJobLinks"];
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "import";
+            links: components["schemas"]["JobLinks"];
             progress: number;
-            report: components["schemas"]["ImportReport"] | null;
+            rate_per_s: number | null;
+            result: components["schemas"]["ImportReport"] | null;
+            started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
-        };
-        ImportJobLinks: {
-            self: string;
-        };
-        ImportJobPage: {
-            items: components["schemas"]["ImportJobSummary"][];
-        };
-        ImportJobSummary: {
-            attempts: number;
-            cancel_requested: boolean;
-            /** Format: date-time */
-            created_at: string;
-            error: components["schemas"]["ErrorDocument"] | null;
-            finished_at: string | null;
-            id: string;
-            links: components["schemas"]["ImportJobLinks"];
-            progress: number;
-            /** @enum {string} */
-            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
         };
         ImportReport: {
             accuracy: components["schemas"]["AccuracyDocument"];
@@ -4313,7 +4236,17 @@ export interface components {
             version: number | null;
             warnings: components["schemas"]["WarningDocument"][];
         };
-        JobDocument: {
+        /** @enum {string} */
+        JobKind: "decode" | "import" | "plan" | "proof" | "package" | "artwork" | "reprocess" | "export" | "drive" | "audit";
+        JobLinks: {
+            events: string;
+            result?: string;
+            self: string;
+        };
+        JobPage: {
+            items: components["schemas"]["JobSummary"][];
+        };
+        JobSummary: {
             attempts: number;
             cancel_requested: boolean;
             /** Format: date-time */
@@ -4330,17 +4263,8 @@ export interface components {
             started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
             total: number | null;
-        };
-        /** @enum {string} */
-        JobKind: "decode" | "import" | "plan" | "proof" | "package" | "artwork" | "reprocess" | "export" | "drive" | "audit";
-        JobLinks: {
-            events: string;
-            result?: string;
-            self: string;
-        };
-        JobPage: {
-            items: components["schemas"]["JobDocument"][];
         };
         JsonValue: unknown;
         KeyDocument: {
@@ -4539,6 +4463,9 @@ export interface components {
             entries: number;
             format: string;
             left_out: number;
+        };
+        MadePlanResult: {
+            plan_version: number;
         };
         MagnetDetailDocument: {
             bill: components["schemas"]["BillDocument"];
@@ -4870,6 +4797,31 @@ export interface components {
             lat_deg: number;
             lon_deg: number;
         };
+        OtherJob: {
+            attempts: number;
+            cancel_requested: boolean;
+            /** Format: date-time */
+            created_at: string;
+            dead_letter: boolean;
+            done: number | null;
+            error: components["schemas"]["ErrorDocument"] | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "decode" | "drive" | "artwork" | "export" | "reprocess";
+            links: components["schemas"]["JobLinks"];
+            progress: number;
+            rate_per_s: number | null;
+            result: null;
+            started_at: string | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
+        };
         OverlayDocument: {
             area_px: number[][][];
             centre_px: number[][][];
@@ -4903,6 +4855,37 @@ export interface components {
              */
             title_block?: components["schemas"]["TitleBlockIn"];
             unit?: ("m" | "ft-us" | "ft-intl") | null;
+        };
+        PackageJob: {
+            attempts: number;
+            cancel_requested: boolean;
+            /** Format: date-time */
+            created_at: string;
+            dead_letter: boolean;
+            done: number | null;
+            error: components["schemas"]["ErrorDocument"] | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "package";
+            links: components["schemas"]["JobLinks"];
+            progress: number;
+            rate_per_s: number | null;
+            result: components["schemas"]["PackageResult"] | null;
+            started_at: string | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
+        };
+        PackageResult: {
+            files: number;
+            plan_version: number;
+            sha256: string;
+            size_bytes: number;
         };
         PacketReceiverIn: {
             /** @default null */
@@ -5111,59 +5094,30 @@ export interface components {
                 [key: string]: unknown;
             };
         };
-        PlanJobDocument: {
+        PlanJob: {
             attempts: number;
             cancel_requested: boolean;
             /** Format: date-time */
             created_at: string;
+            dead_letter: boolean;
+            done: number | null;
             error: components["schemas"]["ErrorDocument"] | null;
             finished_at: string | null;
             id: string;
-            /** @enum {string} */
-            kind: "plan" | "proof" | "package";
-            links: components["schemas"]["PlanJobLinks"];
-            plan_id: string | null;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "plan";
+            links: components["schemas"]["JobLinks"];
             progress: number;
-            result: components["schemas"]["PlanJobResult"] | null;
+            rate_per_s: number | null;
+            result: components["schemas"]["MadePlanResult"] | null;
+            started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
-            steps_done: number | null;
-            steps_total: number | null;
-        };
-        PlanJobLinks: {
-            plan?: string;
-            self: string;
-        };
-        PlanJobPage: {
-            items: components["schemas"]["PlanJobSummary"][];
-        };
-        PlanJobResult: {
-            files?: number;
-            outdated?: boolean;
-            passed?: boolean;
-            plan_version?: number;
-            sha256?: string;
-            size_bytes?: number;
-            weak?: number;
-            wrong?: number;
-        };
-        PlanJobSummary: {
-            attempts: number;
-            cancel_requested: boolean;
-            /** Format: date-time */
-            created_at: string;
-            error: components["schemas"]["ErrorDocument"] | null;
-            finished_at: string | null;
-            id: string;
-            /** @enum {string} */
-            kind: "plan" | "proof" | "package";
-            links: components["schemas"]["PlanJobLinks"];
-            plan_id: string | null;
-            progress: number;
-            /** @enum {string} */
-            state: "queued" | "running" | "done" | "failed" | "cancelled";
-            steps_done: number | null;
-            steps_total: number | null;
+            subject_id: string | null;
+            total: number | null;
         };
         PlanOverview: {
             alignment_id: string;
@@ -5622,6 +5576,31 @@ export interface components {
             /** @default 0.9 */
             weak_below?: number;
         };
+        ProofJob: {
+            attempts: number;
+            cancel_requested: boolean;
+            /** Format: date-time */
+            created_at: string;
+            dead_letter: boolean;
+            done: number | null;
+            error: components["schemas"]["ErrorDocument"] | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "proof";
+            links: components["schemas"]["JobLinks"];
+            progress: number;
+            rate_per_s: number | null;
+            result: components["schemas"]["ProofResult"] | null;
+            started_at: string | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
+        };
         ProofReport: {
             complete: boolean;
             drives: components["schemas"]["DriveResult"][];
@@ -5633,6 +5612,13 @@ export interface components {
             terms: components["schemas"]["ProofTerms"];
             weak: number[];
             wrong: components["schemas"]["WrongInDrive"][];
+        };
+        ProofResult: {
+            outdated: boolean;
+            passed: boolean;
+            plan_version: number;
+            weak: number;
+            wrong: number;
         };
         ProofSummary: {
             /** Format: date-time */
@@ -6762,24 +6748,38 @@ export interface components {
         };
         /** @enum {string} */
         Verdict: "ok" | "warn" | "fail";
-        VerificationDocument: {
+        VerificationInput: {
+            expected_head?: string | null;
+        };
+        VerificationJob: {
+            attempts: number;
+            cancel_requested: boolean;
             /** Format: date-time */
             created_at: string;
+            dead_letter: boolean;
+            done: number | null;
             error: components["schemas"]["ErrorDocument"] | null;
             finished_at: string | null;
             id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "audit";
+            links: components["schemas"]["JobLinks"];
             progress: number;
+            rate_per_s: number | null;
             result: components["schemas"]["VerificationResult"] | null;
+            started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
-        };
-        VerificationInput: {
-            expected_head?: string | null;
+            subject_id: string | null;
+            total: number | null;
         };
         VerificationResult: {
             entries: number;
             fault_count: number;
-            faults: components["schemas"]["AuditFaultDocument"][];
+            faults: components["schemas"]["AuditFault"][];
             head: string | null;
             versions: number;
         };
@@ -7905,7 +7905,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -7960,29 +7960,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["VerificationDocument"];
-                };
-            };
-        };
-    };
-    get_verification: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                verification_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["VerificationDocument"];
+                    "application/json": components["schemas"]["VerificationJob"];
                 };
             };
         };
@@ -9025,7 +9003,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -9075,30 +9053,6 @@ export interface operations {
             };
         };
     };
-    list_imports: {
-        parameters: {
-            query?: {
-                after?: string | null;
-                limit?: number;
-                state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
-            };
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["ImportJobPage"];
-                };
-            };
-        };
-    };
     post_import: {
         parameters: {
             query?: never;
@@ -9143,29 +9097,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["ImportJobDocument"];
-                };
-            };
-        };
-    };
-    get_import: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                import_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["ImportJobDocument"];
+                    "application/json": components["schemas"]["ImportJob"];
                 };
             };
         };
@@ -9178,6 +9110,7 @@ export interface operations {
                 kind?: components["schemas"]["JobKind"] | null;
                 limit?: number;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
+                subject_id?: string | null;
             };
             header?: never;
             path?: never;
@@ -9213,7 +9146,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["PlanJob"] | components["schemas"]["ProofJob"] | components["schemas"]["PackageJob"] | components["schemas"]["ImportJob"] | components["schemas"]["VerificationJob"] | components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -9235,7 +9168,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["PlanJob"] | components["schemas"]["ProofJob"] | components["schemas"]["PackageJob"] | components["schemas"]["ImportJob"] | components["schemas"]["VerificationJob"] | components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -10045,53 +9978,6 @@ export interface operations {
             };
         };
     };
-    list_plan_jobs: {
-        parameters: {
-            query?: {
-                after?: string | null;
-                limit?: number;
-                plan_id?: string | null;
-                state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
-            };
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["PlanJobPage"];
-                };
-            };
-        };
-    };
-    get_plan_job: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                job_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
-                };
-            };
-        };
-    };
     post_plan_preview: {
         parameters: {
             query?: {
@@ -10219,7 +10105,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
+                    "application/json": components["schemas"]["PlanJob"];
                 };
             };
         };
@@ -10452,7 +10338,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
+                    "application/json": components["schemas"]["PackageJob"];
                 };
             };
         };
@@ -10503,7 +10389,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
+                    "application/json": components["schemas"]["ProofJob"];
                 };
             };
         };
