@@ -5,18 +5,20 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal, NotRequired
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
+from pydantic import BaseModel, Field, JsonValue
 from typing_extensions import ReadOnly, TypedDict
 
-from app.errors import InvalidParameter, ReferenceSystemError
+from app.errors import InvalidParameter
 from app.families.surveys import NewMarker
-from app.fields import Flag as Flag
-from app.fields import Number as Number
-from app.fields import Text as Text
-from app.fields import Whole as Whole
 from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
-from app.geodesy.systems import normalize_vertical_datum
+from app.geodesy.systems import VerticalDatum as VerticalDatum
+from app.inputs import Flag as Flag
+from app.inputs import Identifier as Identifier
+from app.inputs import Number as Number
+from app.inputs import StrictModel as StrictModel
+from app.inputs import Text as Text
+from app.inputs import Whole as Whole
 from app.markers.reading import Status
 from app.registry.conditions import grade_columns
 from app.registry.marker_rows import MarkerRow
@@ -126,16 +128,6 @@ def marker_place(row: MarkerRow) -> MarkerPlace:
 # === Schemas of requests that register or change markers: what every family shares.
 
 
-def _vertical_datum(text: str) -> str:
-    try:
-        return normalize_vertical_datum(text)
-    except ReferenceSystemError as error:
-        error.field = None  # the place in the request is
-        raise
-
-
-Identifier = Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
-VerticalDatum = Annotated[Text, Field(min_length=1, max_length=64), AfterValidator(_vertical_datum)]
 VersionKind = Literal["as-planned", "as-built", "resurvey", "correction", "change"]
 Heading = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, lt=360)]
 Accuracy = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6)]
@@ -143,12 +135,6 @@ Metres = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e8, le=1e
 Height = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-12_000, le=100_000)]
 CheckPoints = Annotated[int, Field(strict=True, ge=0, le=10**6)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class StrictModel(BaseModel):
-    """Base of every part of a request: members that it does not know are refused."""
-
-    model_config = ConfigDict(extra="forbid")
 
 
 class _CoordinatesIn(StrictModel):

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from app.errors import InvalidParameter, naming
-from app.fields import Number, Whole
+from app.inputs import Number, Whole
 from app.markers.cerpm import MESSAGE_BYTES
 from app.markers.reading import RadioFinding, Verdict, at_least, worst_verdict
 from app.planning.magnet_checks import DECELERATION_M_S2, REACTION_S, reaction_distance_m

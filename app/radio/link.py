@@ -11,7 +11,7 @@ import numpy.typing as npt
 import scipy
 from pydantic import Field
 
-from app.fields import Number
+from app.inputs import Number
 from app.radio.settings import check_between, check_modulation
 
 Floats = npt.NDArray[np.float64]

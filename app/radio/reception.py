@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pydantic import Field, GetPydanticSchema
 
 from app.errors import InvalidParameter
-from app.fields import Flag, Number, Whole
+from app.inputs import Flag, Number, Whole
 from app.radio.link import LinkModel, sensitivity_dbm
 from app.radio.settings import MAX_CHANNELS, RadioSettings, check_between, check_whole
 

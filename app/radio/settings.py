@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import Field
 
 from app.errors import InvalidParameter
-from app.fields import Number
+from app.inputs import Number
 from app.markers.cerpm import MESSAGE_BYTES
 
 # === Time on air of LoRa packets.

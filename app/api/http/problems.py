@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from typing import Any, Literal, NamedTuple, NotRequired
 
@@ -42,9 +42,10 @@ def with_reference(response: dict[str, Any]) -> dict[str, Any]:
     return {**described, "content": {**described.get("content", {}), "application/json": {"schema": schema}}}
 
 
-def component_schemas() -> dict[str, Any]:
-    """The schemas of all models that are referred to, and of the models within them, by name."""
-    adapters = [(name, mode, TypeAdapter(model)) for name, (model, mode) in _MODELS.items()]
+def component_schemas(others: Iterable[tuple[Any, Mode]] = ()) -> dict[str, Any]:
+    """The schemas of all models that are referred to, of others, and of the models within them, by name."""
+    models = (*_MODELS.values(), *others)
+    adapters = [(number, mode, TypeAdapter(model)) for number, (model, mode) in enumerate(models)]
     _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE)
     found: dict[str, Any] = schemas["$defs"]
     return found
@@ -286,7 +287,9 @@ def install_problem_handlers(app: FastAPI) -> None:
         assert isinstance(error, RequestValidationError)
         found = error.errors()
         faults = [validation_fault(item) for item in found[:MAX_ERRORS]]
-        return problem(VALIDATION, faults[0].detail, request.scope, faults, left_out=len(found) - len(faults))
+        cause = (found[0].get("ctx") or {}).get("error")
+        kind = kind_of(cause) if isinstance(cause, errors.WaymarkError) else None
+        return problem(kind or VALIDATION, faults[0].detail, request.scope, faults, left_out=len(found) - len(faults))
 
     async def on_http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
@@ -331,13 +334,11 @@ def validation_fault(item: Mapping[str, Any]) -> FieldError:
     limits = [text.format(context[name]) for name, text in _CONSTRAINTS.items() if name in context]
     cause = context.get("error")
     if isinstance(cause, errors.WaymarkError):
-        field = cause.field or path
-        if len(location) > 1 and not f"{field}.".startswith(f"{path}."):
-            field = f"{path}.{field}"  # a part of the request names its own field
-        return FieldError(field=field, detail=cause.message, limit=cause.limit, cure=cause.cure)
+        inner = cause.field.split(".") if cause.field else []  # in the part of the request that was checked
+        outer = location[1:] if not inner or inner[0] != location[-1] else location[1:-1]
+        return FieldError(".".join((*outer, *inner)) or path, cause.message, cause.limit, cause.cure)
     near = f"did you mean {context['near']}? If not, " if "near" in context else ""
-    unknown = f"{near}leave {path} out"
-    cures = {"missing": f"send {path}", "extra_forbidden": unknown, "unexpected_keyword_argument": unknown}
+    cures = {"missing": f"send {path}", "extra_forbidden": f"{near}leave {path} out"}
     return FieldError(
         field=path,
         detail=f"{path}: {item['msg']}",

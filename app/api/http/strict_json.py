@@ -55,9 +55,12 @@ def validated(adapter: TypeAdapter[T], value: object, *where: str) -> T:
         return adapter.validate_python(value)
     except ValidationError as error:
         if error.error_count() > _MAX_LISTED:
-            fault: Any = {"type": "invalid", "loc": where, "msg": f"{error.error_count()} values are not as documented"}
-            raise RequestValidationError([fault]) from None
+            message = f"{error.error_count()} values are not as documented"
+            raise RequestValidationError([{"type": "invalid", "loc": where, "msg": message}]) from None
         faults = error.errors(include_url=False, include_input=False)
+        for fault in faults:
+            if fault["type"] == "unexpected_keyword_argument":  # what pydantic calls it in a dataclass
+                fault["type"], fault["msg"] = _UNKNOWN, "Extra inputs are not permitted"
         names = _names_in(adapter) if any(fault["type"] == _UNKNOWN for fault in faults) else ()
         raise RequestValidationError([_located(fault, where, names) for fault in faults]) from None
 
@@ -87,26 +90,11 @@ def _names_in(adapter: TypeAdapter[Any]) -> tuple[str, ...]:
 
 # Long lists stop at their first error: a body of 1 MiB has room for 200,000 of them.
 Position = Annotated[list[Number], Field(min_length=2, max_length=4), FailFast()]
-Line = Annotated[list[Position], Field(min_length=2), FailFast()]
 Ring = Annotated[list[Position], Field(min_length=4), FailFast()]
 
 
 class _Geometry(BaseModel):
     model_config = ConfigDict(extra="ignore")  # RFC 7946, section 6.1: foreign members
-
-
-class GeoLineIn(_Geometry):
-    """A line."""
-
-    type: Literal["LineString"]
-    coordinates: Line
-
-
-class MultiLineStringIn(_Geometry):
-    """Several lines."""
-
-    type: Literal["MultiLineString"]
-    coordinates: Annotated[list[Line], Field(min_length=1), FailFast()]
 
 
 class PolygonIn(_Geometry):
@@ -125,5 +113,4 @@ class MultiPolygonIn(_Geometry):
     ]
 
 
-AnyLine = Annotated[GeoLineIn | MultiLineStringIn, Field(discriminator="type")]
 AnyPolygon = Annotated[PolygonIn | MultiPolygonIn, Field(discriminator="type")]

@@ -126,7 +126,7 @@ def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Call
         )
         return created_response(document, replayed, path="/v1/alignments")
     document, replayed = alignments.add(
-        caller, declared.name, upload.file, upload.file_name, declared.declaration(), upload.idempotency
+        caller, declared.name, upload.file, upload.file_name, declared, upload.idempotency
     )
     return created_response(document, replayed, path="/v1/alignments")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, cast
 
 import orjson
 from fastapi import Path, Query, Request, Response
@@ -36,8 +36,9 @@ from app.api.http.responses import (
 )
 from app.api.http.routes import Router
 from app.api.jobs import queued_job
-from app.api.plans.schemas import PackageIn, PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
-from app.planning.outputs.package import MEDIA_TYPES
+from app.api.plans.schemas import PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
+from app.formats.surveys.declaration import Unit
+from app.planning.outputs.package import MEDIA_TYPES, PackageOptions
 from app.planning.proof import ProofReport
 from app.planning.rules import read_rules, rules_schema
 from app.services.plans.documents import (
@@ -219,7 +220,7 @@ def get_plan_file(
     plans: Service,
     proofs: Annotated[Proofs, use_case(lambda cases: cases.proofs)],
     crs: Annotated[Text | None, Query(max_length=64, description="CRS of the stakeout.")] = None,
-    unit: Annotated[Literal["m", "ft-us", "ft-intl"] | None, Query(description="Unit of the stakeout.")] = None,
+    unit: Annotated[Unit | None, Query(description="Unit of the stakeout.")] = None,
 ) -> Response:
     """Download a file of a plan.
 
@@ -288,7 +289,7 @@ PackageService = Annotated[Packages, use_case(lambda cases: cases.packages)]
     responses=document_response(PackageJob, 404, 409, status=202, description="Queued; Location leads to its progress"),
 )
 def post_package(
-    plan_id: PlanId, wanted: PackageIn, caller: Caller, packages: PackageService, idempotency: Idempotency
+    plan_id: PlanId, wanted: PackageOptions, caller: Caller, packages: PackageService, idempotency: Idempotency
 ) -> Response:
     """Pack all files of a plan.
 
@@ -296,7 +297,7 @@ def post_package(
 
     Every plate is read back from its drawing first. The package replaces the plan's earlier one.
     """
-    return queued_job(*packages.request(caller, plan_id, wanted.options(), idempotency))
+    return queued_job(*packages.request(caller, plan_id, wanted, idempotency))
 
 
 @package_router.get(

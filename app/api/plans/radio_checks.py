@@ -12,7 +12,7 @@ from app.api.http.dependencies import Caller
 from app.api.http.permissions import READERS
 from app.api.http.responses import document_response, json_response
 from app.api.http.routes import Router
-from app.fields import Flag
+from app.inputs import Flag
 from app.planning.radio_checks import RadioCheck, RadioPlan, check_radio
 
 router = Router("/v1/radio-checks", "cerpms")

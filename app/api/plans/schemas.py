@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.encoders.plate import ArtworkFormat
-from app.families.documents import Flag, Identifier, Number, Text, VerticalDatum
+from app.families.documents import Identifier, Text
 from app.formats.alignments.read import RoadLanes
 from app.planning.alignment import AlignmentDeclaration
 from app.planning.proof import ProofTerms
@@ -21,29 +21,11 @@ class _Body(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class AlignmentIn(_Body):
-    """What is declared of a file with a road; what the file states may be left out."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignmentIn(AlignmentDeclaration):
+    """What is declared of a file with a road, and the name of the alignment."""
 
     name: Name
-    crs: Annotated[Text | None, Field(max_length=64, examples=["EPSG:25832"])] = None
-    realization: Annotated[Text | None, Field(max_length=64, examples=["ITRF2014"])] = None
-    epoch: Annotated[Number | None, Field(ge=1900, le=2100, description="Decimal year.")] = None
-    vertical_datum: Annotated[VerticalDatum | None, Field(examples=["ellipsoid"])] = None
-    unit: Literal["m", "ft-us", "ft-intl"] | None = None
-    height_unit: Literal["m", "ft-us", "ft-intl"] | None = None
-    ignore_heights: bool = False
-    origin: Annotated[
-        tuple[Number, Number] | None,
-        Field(description="Longitude and latitude of the origin of local coordinates. Such a road is not surveyed."),
-    ] = None
-    bearing_deg: Annotated[
-        Number, Field(ge=-360, le=360, description="Direction of the local y axis; only with `origin`.")
-    ] = 0.0
-
-    def declaration(self) -> AlignmentDeclaration:
-        """The declaration of the file."""
-        values = self.model_dump(exclude={"name"})
-        return AlignmentDeclaration(**values)
 
 
 class RoadAlignmentIn(_Body):
@@ -140,50 +122,3 @@ class ProofIn(ProofTerms):
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"drives": 20, "seed": 7, "conditions": ["day", "night+rain"]}, {}]}
     )
-
-
-class TitleBlockIn(_Body):
-    """What the title block of the drawings states; empty fields are left to be filled in by hand."""
-
-    owner: Annotated[Text, Field(max_length=80)] = ""
-    number: Annotated[Text, Field(max_length=80, description="Identification number of the set.")] = ""
-    date: Annotated[Text, Field(max_length=80, description="Date of issue.")] = ""
-    creator: Annotated[Text, Field(max_length=80)] = ""
-    approver: Annotated[Text, Field(max_length=80)] = ""
-    title: Annotated[Text, Field(max_length=80, description="Without, the name of the plan.")] = ""
-
-
-class PackageIn(_Body):
-    """How a plan is handed out; every member may be left out."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "examples": [
-                {
-                    "crs": "EPSG:25832",
-                    "scale": 500,
-                    "title_block": {"owner": "Example Road Agency", "date": "2026-11-22"},
-                    "formats": ["pdf", "dxf"],
-                },
-                {},
-            ]
-        },
-    )
-
-    crs: Annotated[Text | None, Field(max_length=64, description="Projected CRS of the stakeout.")] = None
-    unit: Literal["m", "ft-us", "ft-intl"] | None = None
-    scale: Annotated[
-        int | None, Field(strict=True, ge=1, le=100_000, description="Of the drawings: 250, 500, 1000, 2000 or 5000.")
-    ] = None
-    title_block: TitleBlockIn = TitleBlockIn()
-    formats: Annotated[list[ArtworkFormat], Field(min_length=1, max_length=4, description="Of each plate.")] = [
-        ArtworkFormat.PDF,
-        ArtworkFormat.SVG,
-    ]
-    heaters: Annotated[Flag, Field(description="Heating tracks under dark units.")] = False
-    leds: Annotated[Flag, Field(description="Light sources under light units.")] = False
-
-    def options(self) -> dict[str, Any]:
-        """The options as JSON."""
-        return self.model_dump(mode="json")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from app.errors import InvalidParameter
 
@@ -20,7 +20,8 @@ FIXED_LAYOUTS = {
 LAYOUTS = (*FIXED_LAYOUTS, "named")
 ENCODINGS = ("utf-8", "utf-16", "windows-1252", "iso-8859-1", "iso-8859-2", "windows-1250", "cp437", "cp850")
 DUPLICATES = ("refuse", "store")
-METRES = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.3048}
+Unit = Literal["m", "ft-us", "ft-intl"]
+METRES: dict[str, float] = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.3048}
 """Metres to a unit of length: US survey foot and international foot (NIST SP 811)."""
 FEET = "ft"
 """Unit of a file that does not state which foot."""

@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
-from app.fields import Number, Whole
 from app.formats.text import TableWriter
+from app.inputs import Number, Whole
 from app.planning.plan import Plan, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
 from app.planning.rules import CameraRules
 

@@ -17,6 +17,7 @@ from app.families import get_family
 from app.formats.alignments.geometry import AlignmentFile
 from app.formats.alignments.read import read_alignment
 from app.formats.format import SpooledFile
+from app.formats.surveys.declaration import Unit
 from app.geodesy.systems import is_ellipsoidal
 from app.markers.magnet_design import Codebook
 from app.markers.plate import PlateGeometry
@@ -390,10 +391,9 @@ def make_plan(
 
 
 @decoder_task(*_PLAN)
-def write_file_of_plan(document: bytes, name: str, crs: str | None = None, unit: str | None = None) -> bytes:
+def write_file_of_plan(document: bytes, name: str, crs: str | None = None, unit: Unit | None = None) -> bytes:
     """Write a file of a plan; CRS and unit are those of the stakeout."""
-    options = OutputOptions(crs, unit, draw_trade_off=draw_trade_off)
-    return write_plan_file(_plan(document), name, options)
+    return write_plan_file(_plan(document), name, OutputOptions(crs, unit), draw_trade_off)
 
 
 @decoder_task(*_PLAN)
@@ -445,7 +445,7 @@ def read_face(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> Sequence
 @lru_cache(maxsize=1)
 def _package(document: bytes, options: PackageOptions) -> Package:
     """A plan with what its parts share: one a process, kept until another plan is packed."""
-    return Package(_plan(document), options)
+    return Package(_plan(document), options, draw_trade_off)
 
 
 # === Proofs of plans.

@@ -4830,32 +4830,6 @@ export interface components {
             markers_px: number[][];
             right_px: number[][][];
         };
-        PackageIn: {
-            crs?: string | null;
-            /**
-             * @default [
-             *       "pdf",
-             *       "svg"
-             *     ]
-             */
-            formats?: components["schemas"]["ArtworkFormat"][];
-            /** @default false */
-            heaters?: boolean;
-            /** @default false */
-            leds?: boolean;
-            scale?: number | null;
-            /**
-             * @default {
-             *       "owner": "",
-             *       "number": "",
-             *       "date": "",
-             *       "creator": "",
-             *       "approver": ""
-             *     }
-             */
-            title_block?: components["schemas"]["TitleBlockIn"];
-            unit?: ("m" | "ft-us" | "ft-intl") | null;
-        };
         PackageJob: {
             attempts: number;
             cancel_requested: boolean;
@@ -4880,6 +4854,23 @@ export interface components {
             state: "queued" | "running" | "done" | "failed" | "cancelled";
             subject_id: string | null;
             total: number | null;
+        };
+        PackageOptions: {
+            crs?: string | null;
+            /**
+             * @default [
+             *       "pdf",
+             *       "svg"
+             *     ]
+             */
+            formats?: components["schemas"]["ArtworkFormat"][];
+            /** @default false */
+            heaters?: boolean;
+            /** @default false */
+            leds?: boolean;
+            scale?: number | null;
+            title_block?: components["schemas"]["TitleBlock"];
+            unit?: ("m" | "ft-us" | "ft-intl") | null;
         };
         PackageResult: {
             files: number;
@@ -6476,7 +6467,7 @@ export interface components {
         TileSets: {
             tilesets: components["schemas"]["TileSet"][];
         };
-        TitleBlockIn: {
+        TitleBlock: {
             /** @default  */
             approver?: string;
             /** @default  */
@@ -10328,7 +10319,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["PackageIn"];
+                "application/json": components["schemas"]["PackageOptions"];
             };
         };
         responses: {

@@ -59,7 +59,7 @@ function Package({ plan }) {
   const { job, start } = useUnfinished(plan, "package");
   const [turn, setTurn] = useState(0);
   const form = useForm({ formats: "pdf, svg" });
-  const schema = useLoad(() => loadSchema("PackageIn"), []);
+  const schema = useLoad(() => loadSchema("PackageOptions"), []);
   const packed = useLoad(async (signal) => {
     const { items: [last] } = await ok(api.GET("/v1/jobs", { params: { query: { kind: "package", subject_id: plan.id, state: "done", limit: 1 } }, signal }));
     return last ? (await oneJob(last.id, "package", signal)).result : null;

@@ -91,7 +91,7 @@ def test_a_plan_is_packed_with_its_drawings_sheets_and_artwork(client: httpx.Cli
     for entry in manifest["files"]:
         content = archive.read(entry["name"])
         assert (len(content), hashlib.sha256(content).hexdigest()) == (entry["size"], entry["sha256"])
-    assert manifest["options"]["drawings"]["block"]["owner"] == "An Agency"
+    assert manifest["options"]["title_block"]["owner"] == "An Agency"
     names = archive.namelist()
     assert sum(name.startswith("artwork/plate-") for name in names) == plan["counts"]["plate"]
     assert {"drawings.pdf", "bill.csv", "stakeout.dxf", "artwork/quality.pdf"} <= set(names)
