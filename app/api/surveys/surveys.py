@@ -26,7 +26,6 @@ from app.api.http.responses import (
 from app.api.http.routes import Router
 from app.api.jobs import queued_job
 from app.api.markers.searches import Filtered, check_measures
-from app.api.surveys.schemas import DECLARATION_EXAMPLE, DeclarationIn
 from app.errors import InvalidParameter, UnreadableUpload
 from app.families import FamilyName
 from app.families.documents import StrictModel
@@ -38,7 +37,13 @@ from app.services.request_work import counted_steps
 from app.services.surveys.exports import MAX_LEFT_OUT_IDS, STREAMED, SUFFIXES, WHOLE, ExportJobs, filter_of
 from app.services.surveys.exports import Exports as ExportsService
 from app.services.surveys.import_jobs import ImportJobs, takes_long
-from app.services.surveys.import_report import ImportInput, ImportReport, import_input
+from app.services.surveys.import_report import (
+    DECLARATION_EXAMPLE,
+    DeclarationIn,
+    ImportInput,
+    ImportReport,
+    import_input,
+)
 from app.services.surveys.imports import Imports as ImportsService
 
 # === /v1/imports: surveys come in.
@@ -60,7 +65,6 @@ _BODY = form_body(
 @dataclass(frozen=True, slots=True)
 class _Asked:
     given: ImportInput
-    declared: dict[str, Any]
     idempotency: IdempotencyKey | None
     as_job: bool
 
@@ -92,10 +96,10 @@ async def get_asked(
         file = part.spooled
         if not file.size:
             raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
-        declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
+        declared = await read_declaration(DeclarationIn, text, "body", "declaration")
         as_job = wants_job(prefer) or takes_long(file)
         key = idempotency_of(request, idempotency_key, text, file)
-        yield _Asked(import_input(declared, file), declared, key, as_job)
+        yield _Asked(import_input(declared, file), key, as_job)
 
 
 Asked = Annotated[_Asked, Depends(get_asked)]
@@ -126,7 +130,7 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
     `Prefer: respond-async`: 202, and the job at Location has the report as its result.
     """
     if asked.as_job:
-        return queued_job(*jobs.submit(caller, asked.declared, asked.given.file, asked.idempotency))
+        return queued_job(*jobs.submit(caller, asked.given, asked.idempotency))
     try:
         report, replayed = imports.run(caller, asked.given, asked.idempotency)
     except InvalidParameter as error:

@@ -3228,7 +3228,7 @@ export interface components {
             /** @default null */
             vehicle?: string | null;
         };
-        ControlPointIn: {
+        ControlPoint: {
             easting: number;
             /** @default null */
             local_easting?: number | null;
@@ -3285,7 +3285,12 @@ export interface components {
         };
         DeclarationIn: {
             /** @default null */
-            area_deg?: number[] | null;
+            area_deg?: [
+                number,
+                number,
+                number,
+                number
+            ] | null;
             /** @default null */
             check_digits?: number | null;
             columns?: {
@@ -3319,7 +3324,10 @@ export interface components {
             format?: ("csv" | "geojson" | "gpkg" | "shapefile" | "kml" | "kmz" | "gpx" | "landxml" | "jobxml" | "dxf" | "gsi") | null;
             geometry?: components["schemas"]["GeometryIn"];
             /** @default null */
-            height_range_m?: number[] | null;
+            height_range_m?: [
+                number,
+                number
+            ] | null;
             /** @default null */
             height_unit?: ("m" | "ft-us" | "ft-intl") | null;
             /** @default false */
@@ -3328,11 +3336,12 @@ export interface components {
             layer?: string | null;
             /** @default null */
             layout?: ("named" | "pnezd" | "penzd" | "nezd" | "enzd") | null;
+            /** @default [] */
             leave_out?: number[];
             /** @default 0 */
             list_rows?: number;
             /** @default null */
-            local_grid?: components["schemas"]["LocalGridIn"] | null;
+            local_grid?: components["schemas"]["LocalGrid"] | null;
             /**
              * @default code
              * @enum {string}
@@ -4434,6 +4443,16 @@ export interface components {
             /** @default 50 */
             near_m?: number;
         };
+        LocalGrid: {
+            control_points: components["schemas"]["ControlPoint"][];
+            /** @default 0.05 */
+            limit_m?: number;
+            /**
+             * @default fixed
+             * @enum {string}
+             */
+            scale?: "fixed" | "free";
+        };
         LocalGridDocument: {
             control_points: components["schemas"]["ControlResidual"][];
             limit_m: number;
@@ -4442,16 +4461,6 @@ export interface components {
             rotation_deg: number;
             scale: string;
             scale_ppm: number;
-        };
-        LocalGridIn: {
-            control_points: components["schemas"]["ControlPointIn"][];
-            /** @default 0.05 */
-            limit_m?: number;
-            /**
-             * @default fixed
-             * @enum {string}
-             */
-            scale?: "fixed" | "free";
         };
         /** @enum {string} */
         LocalizationGrade: "cm" | "dm" | "m" | "unfit";
