@@ -456,9 +456,11 @@ async def _stream(
 def _number(last_event_id: str) -> int:
     if not (last_event_id.isascii() and last_event_id.isdigit()) or len(last_event_id) > _MAX_DIGITS:
         raise InvalidParameter(
-            f"{last_event_id[:40]!r} is no id of an event", field="Last-Event-ID", limit="the id of an event, a number",
+            f"{last_event_id[:40]!r} is no id of an event",
+            field="Last-Event-ID",
+            limit="the id of an event, a number",
             cure="send the id of the last event as it came",
-        )  # fmt: skip
+        )
     return int(last_event_id)
 
 

@@ -59,15 +59,20 @@ def proof(
         terms = _terms({name: value for name, value in options.items() if value is not None})
         if not (folder / _PLAN_FILE).is_file():
             raise InvalidParameter(
-                f"{folder} has no {_PLAN_FILE}", field="folder", limit="a folder with a plan",
+                f"{folder} has no {_PLAN_FILE}",
+                field="folder",
+                limit="a folder with a plan",
                 cure="make the plan with waymark plan ROAD --rules RULES --out FOLDER",
-            )  # fmt: skip
+            )
         with ProgressBar(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task("Driving", total=None)
             report = run_proof(
-                folder / _PLAN_FILE, terms, folder / _RESULTS_FILE, workers or os.cpu_count() or 1,
+                folder / _PLAN_FILE,
+                terms,
+                folder / _RESULTS_FILE,
+                workers or os.cpu_count() or 1,
                 lambda done, total: bar.update(task, completed=done, total=total),
-            )  # fmt: skip
+            )
     (folder / "proof.json").write_bytes(report.write(orjson.OPT_INDENT_2))
     (folder / "proof.csv").write_text(markers_csv(report))
     _print(report, folder)

@@ -454,9 +454,11 @@ class JobFiles:
             raise NotFound(f"a {job.kind} makes no file", field="job_id", cure="follow links.result of the job")
         if job.state != "done" or job.result is None:
             raise Conflict(
-                f"the job is {job.state}", field="job_id", limit="jobs that are done",
+                f"the job is {job.state}",
+                field="job_id",
+                limit="jobs that are done",
                 cure=f"GET /v1/jobs/{job_id}/events reports when it is",
-            )  # fmt: skip
+            )
         if job.result.get("blob_key") is None:
             raise NotFound(
                 "the file of this job has expired", field="job_id", limit=f"{KEPT.days} days", cure="ask for it again"

@@ -111,8 +111,11 @@ def _draw_frame(sheet: Sheet) -> None:
     sheet.rectangle(left - _BORDER_MM, bottom - _BORDER_MM, right + _BORDER_MM, top + _BORDER_MM, 0.18)
     middle_x, middle_y = PAGE_MM[0] / 2, PAGE_MM[1] / 2
     for x, y, out_x, out_y in (
-        (left, middle_y, -1, 0), (right, middle_y, 1, 0), (middle_x, bottom, 0, -1), (middle_x, top, 0, 1),
-    ):  # fmt: skip
+        (left, middle_y, -1, 0),
+        (right, middle_y, 1, 0),
+        (middle_x, bottom, 0, -1),
+        (middle_x, top, 0, 1),
+    ):
         ends = [(x + k * out_x * _BORDER_MM, y + k * out_y * _BORDER_MM) for k in (-1, 1)]
         sheet.lines(ends, 0.7)
     columns, rows = int(PAGE_MM[0] // _FIELD_MM), int(PAGE_MM[1] // _FIELD_MM)

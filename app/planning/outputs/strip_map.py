@@ -254,14 +254,18 @@ def _draw_facts(sheet: Sheet, plan: Plan, strips: Sequence[Strip]) -> None:
         ("Positions", str(road.grade)),
         ("Heights", datum),
         ("Checks", checks),
-        ("Left out, moved", f"{sum(m.moved_m is None for m in plan.left_out)}, "
-                            f"{sum(m.moved_m is not None for m in plan.left_out)}"),
+        (
+            "Left out, moved",
+            f"{sum(m.moved_m is None for m in plan.left_out)}, {sum(m.moved_m is not None for m in plan.left_out)}",
+        ),
         ("Strips", f"{len(strips)} at 1 : {strips[0].scale}" if strips else "0"),
-    ]  # fmt: skip
+    ]
     hole = plan.rules.installation
     if hole.hole_diameter_mm is not None or hole.hole_depth_mm is not None:
-        sizes = [f"diameter {hole.hole_diameter_mm:g} mm" if hole.hole_diameter_mm else "",
-                 f"depth {hole.hole_depth_mm:g} mm" if hole.hole_depth_mm else ""]  # fmt: skip
+        sizes = [
+            f"diameter {hole.hole_diameter_mm:g} mm" if hole.hole_diameter_mm else "",
+            f"depth {hole.hole_depth_mm:g} mm" if hole.hole_depth_mm else "",
+        ]
         rows.append(("Holes for magnets", ", ".join(size for size in sizes if size)))
     for label, value in rows:
         sheet.text(x, y, label, 7, colour=GREY)

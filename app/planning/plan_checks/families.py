@@ -173,9 +173,11 @@ def radio_settings(plan: Plan) -> RadioSettings | None:
         return None
     if rules.spreading_factor is not None and rules.interval_s is not None:
         return replace(
-            _first_settings(rules), spreading_factor=rules.spreading_factor, interval_s=rules.interval_s,
+            _first_settings(rules),
+            spreading_factor=rules.spreading_factor,
+            interval_s=rules.interval_s,
             bandwidth_hz=rules.bandwidth_hz,
-        )  # fmt: skip
+        )
     mean = _radio_plan(plan, cerpms, rules, _first_settings(rules))
     found = _recommended(mean)
     markers, _marker = _busiest(cerpms, found.air)
@@ -197,10 +199,12 @@ def _radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules, 
     length_m = sum(plan.alignment.lane(name).length_m for name in lanes)
     spacing_m = min(max(2 * length_m / len(cerpms) / len(lanes), SPACINGS_M[0]), SPACINGS_M[1])
     made = RadioPlan(
-        settings, rules.region or _DEFAULT_REGION, EvenRoad(spacing_m),
+        settings,
+        rules.region or _DEFAULT_REGION,
+        EvenRoad(spacing_m),
         design_speed_m_s=max(float(lane.design_speed_m_s.max()) for lane in plan.alignment.lanes),
         preview=PreviewRule(distance_m=rules.preview_m),
-    )  # fmt: skip
+    )
     return replace(made, receiver=replace(made.receiver, channels=max(settings.channels, made.receiver.channels)))
 
 

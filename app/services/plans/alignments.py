@@ -8,7 +8,7 @@ from datetime import timedelta
 from pydantic import TypeAdapter
 
 from app.errors import InvalidParameter
-from app.formats.alignments.read import RegisteredRoad, RoadLanes, RoadStation, write_registered_road
+from app.formats.alignments.read import RegisteredRoad, RoadLanes, write_registered_road
 from app.formats.format import SpooledFile
 from app.geodesy import LocalizationGrade
 from app.planning.alignment import AlignmentDeclaration
@@ -19,6 +19,7 @@ from app.registry.plans import ALIGNMENTS, AlignmentRow, list_for_map
 from app.registry.resources import first_version
 from app.registry.roads import ROADS, RoadRow
 from app.registry.spatial import Box
+from app.roads.lane_line import CalibrationPoint
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
 from app.services.blobs import staged
@@ -221,6 +222,6 @@ def _registered_road(row: RoadRow, lanes: RoadLanes) -> RegisteredRoad:
         note=row.transform_note,
         accuracy_m=row.given.get("transform_accuracy_m"),
         lanes=lanes,
-        calibration=[RoadStation(**point) for point in row.calibration],
+        calibration=[CalibrationPoint(**point) for point in row.calibration],
         parts=[[(point[0], point[1]) for point in part] for part in row.parts],
     )

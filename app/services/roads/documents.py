@@ -305,7 +305,7 @@ def route_of(row: RoadRow) -> Route:
 @lru_cache(maxsize=64)
 def _route(content: bytes) -> Route:
     parts, points = orjson.loads(content)
-    return build_route(parts, [calibration_point(point) for point in points])
+    return build_route(parts, [CalibrationPoint(**point) for point in points])
 
 
 def build_route(parts: Sequence[Sequence[Sequence[float]]], points: Sequence[CalibrationPoint]) -> Route:
@@ -318,11 +318,6 @@ def build_route(parts: Sequence[Sequence[Sequence[float]]], points: Sequence[Cal
     """
     axis = Axis(parts)
     return Route(axis, calibrate(axis.part_ranges_m, points))
-
-
-def calibration_point(stored: StoredStation) -> CalibrationPoint:
-    """A calibration point as it is stored."""
-    return CalibrationPoint(stored["part"], stored["chainage_m"], stored["measure_m"], stored["ahead_m"])
 
 
 def is_ambiguous(feet: Sequence[Foot]) -> bool:

@@ -144,14 +144,6 @@ class SurveyRow(TypedDict):
     height_m: Annotated[float | None, Field(description="Above the declared vertical datum.")]
 
 
-class DetectedDocument(TypedDict):
-    """A property of the file that was not declared, and the evidence for it."""
-
-    what: str
-    value: str
-    evidence: str
-
-
 class Residual(TypedDict):
     """Surveyed position minus registered position of one row."""
 
@@ -182,7 +174,7 @@ class ImportReport(TypedDict):
     crs: str
     localization_grade: str
     transform_note: str | None
-    detected: Annotated[list[DetectedDocument], Field(description="What was not declared, with its evidence.")]
+    detected: Annotated[list[Detected], Field(description="What was not declared, with its evidence.")]
     local_grid: LocalGridDocument | None
     accuracy: Annotated[AccuracyDocument, Field(description="Of the RMSE that was declared for the whole survey.")]
     rows: int
@@ -216,11 +208,6 @@ def comparison_document(
     ]
     drawn = draw_residuals(survey, found, tolerance_m)
     return {**found.document(tolerance_m), "residuals": residuals, "map_svg": drawn}
-
-
-def detected_document(detected: Detected) -> DetectedDocument:
-    """A detected property as reports of imports have it."""
-    return document_of(DetectedDocument, detected)
 
 
 def fault_document(fault: Fault) -> FaultDocument:
@@ -284,7 +271,7 @@ def import_report(
         "crs": table.crs,
         "localization_grade": grade["localization_grade"],
         "transform_note": grade["transform_note"],
-        "detected": [detected_document(detected) for detected in table.detected],
+        "detected": list(table.detected),
         "local_grid": local_grid,
         "accuracy": accuracy_document(stated.horizontal_rmse_m, stated.vertical_rmse_m, stated.check_points),
         "rows": table.rows,
