@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.ext.compiler import compiles
@@ -202,7 +201,10 @@ class AlignmentLanes:
 
 
 def add_lanes(
-    connection: sa.Connection, agency_id: str, alignment_id: str, lanes: Sequence[tuple[dict[str, object], list[Any]]]
+    connection: sa.Connection,
+    agency_id: str,
+    alignment_id: str,
+    lanes: Sequence[tuple[dict[str, object], list[list[float]]]],
 ) -> None:
     """Store the properties and the points [lon, lat] of the lanes of a new alignment."""
     rows = [

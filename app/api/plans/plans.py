@@ -1,13 +1,15 @@
-"""/v1/plans: markers placed on a road by rules, checked, approved and committed; their rules, packages and proofs."""
+"""/v1/plans: markers placed on a road by rules, checked, proved, approved, committed and packed; radio checks."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, cast
 
 import orjson
 from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from pydantic import ConfigDict, Field, JsonValue, with_config
 
 from app.api.http.dependencies import (
     AfterVersion,
@@ -36,10 +38,12 @@ from app.api.http.responses import (
 )
 from app.api.http.routes import Router
 from app.api.jobs import queued_job
-from app.api.plans.schemas import PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
+from app.api.plans.alignments import Name
 from app.formats.surveys.declaration import Unit
+from app.inputs import Flag, StrictModel
 from app.planning.outputs.package import MEDIA_TYPES, PackageOptions
-from app.planning.proof import ProofReport
+from app.planning.proof import ProofReport, ProofTerms
+from app.planning.radio_checks import RadioCheck, RadioPlan, check_radio
 from app.planning.rules import read_rules, rules_schema
 from app.services.plans.documents import (
     AsBuiltDocument,
@@ -56,6 +60,81 @@ from app.services.plans.packages import Packages
 from app.services.plans.plans import Plans
 from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, Proofs
 from app.services.progress import JobDocument, PackageJob, PlanJob, ProofJob
+
+# === Bodies of requests: rules are a document as docs/plans.md describes it.
+
+
+MAX_RULES_TEXT = 50_000
+"""Longest text of rules. [characters] 25 times the examples; as YAML it takes seconds."""
+
+
+class PlanIn(StrictModel):
+    """A plan to make: the rules are a document as docs/plans.md describes it."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "L 560, plates every 100 m",
+                    "alignment_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "rules": {"version": 1, "plates": {"spacing_m": 100}},
+                }
+            ]
+        },
+    )
+
+    name: Name
+    alignment_id: Identifier
+    rules: dict[str, object]
+
+
+class PlanPreviewIn(StrictModel):
+    """Rules to try on an alignment."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "alignment_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "rules": {"version": 1, "plates": {"spacing_m": 50}},
+                }
+            ]
+        },
+    )
+
+    alignment_id: Identifier
+    rules: dict[str, object]
+
+
+class RulesTextIn(StrictModel):
+    """A document of rules as it stands in a file."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"text": "version: 1\nplates:\n  spacing_m: 50\n"}]})
+
+    text: str = Field(max_length=MAX_RULES_TEXT, description="YAML 1.2 or JSON.")
+
+
+class PlanPatch(StrictModel):
+    """What to change of a plan; new rules place and check it again."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"rules": {"version": 1, "plates": {"spacing_m": 50}}, "reason": "closer in the bends"}]
+        },
+    )
+
+    name: Name | None = None
+    rules: dict[str, object] | None = None
+    reason: Annotated[Text | None, Field(max_length=500)] = None
+
+
+class ProofIn(ProofTerms):
+    """What is driven, and how; every member has a default."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"drives": 20, "seed": 7, "conditions": ["day", "night+rain"]}, {}]}
+    )
+
 
 # === /v1/plan-rules and /v1/plan-previews: rules of plans, and what they would place.
 
@@ -366,3 +445,38 @@ def get_proof(plan_id: PlanId, caller: Caller, proofs: ProofService) -> Response
     """
     data, row = proofs.file(caller, plan_id, REPORT_FILE)
     return Response(data, media_type="application/json", headers={"ETag": f'"{row.version}-{REPORT_FILE}"'})
+
+
+# === /v1/radio-checks: whether markers along a road can be read in time, and lawfully.
+
+
+radio_router = Router("/v1/radio-checks", "cerpms")
+
+_RADIO_EXAMPLES: list[JsonValue] = [
+    {"radio": {"spreading_factor": 7, "bandwidth_hz": 500_000, "interval_s": 2.0}, "design_speed_m_s": 13.4},
+    {
+        "region": "EU868",
+        "radio": {"frequency_hz": 868_300_000, "bandwidth_hz": 125_000, "interval_s": 10.0, "power_dbm": 11.0},
+        "road": {"spacing_m": 24.384, "sides": 1},
+        "recommend": True,
+    },
+]
+
+
+@with_config(ConfigDict(extra="forbid", json_schema_extra={"examples": _RADIO_EXAMPLES}))
+@dataclass(frozen=True, slots=True)
+class RadioCheckIn(RadioPlan):
+    """A plan to check."""
+
+    recommend: Annotated[
+        Flag, Field(description="Also search for lawful settings that reach it; takes a second or two.")
+    ] = False
+
+
+@radio_router.post("", READERS, expensive=True, responses=document_response(RadioCheck))
+def post_radio_check(wanted: RadioCheckIn, caller: Caller) -> Response:
+    """Check the radios of CERPMs on a road.
+
+    Law, link, collisions, reading in time, battery. Nothing is stored.
+    """
+    return json_response(check_radio(wanted, recommend=wanted.recommend))

@@ -3522,7 +3522,7 @@ export interface components {
             min_gap_m?: number;
             segment_m: number;
         };
-        DetectedDocument: {
+        Detected: {
             evidence: string;
             value: string;
             what: string;
@@ -4179,7 +4179,7 @@ export interface components {
                 [key: string]: number;
             };
             crs: string;
-            detected: components["schemas"]["DetectedDocument"][];
+            detected: components["schemas"]["Detected"][];
             dry_run: boolean;
             extent_deg: number[] | null;
             faults: components["schemas"]["FaultDocument"][];
