@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import access, drives, fleet, health, jobs, ogc, reprocessing, roads, uploads
+from app.api import access, drives, fleet, health, jobs, ogc, reprocessing, roads, surveys, uploads
 from app.api.decodes import decodes
 from app.api.http import system, ui
 from app.api.http.compression import Compressed
@@ -24,11 +24,10 @@ from app.api.http.problems import install_problem_handlers
 from app.api.http.routes import permissions_of
 from app.api.jobs import Streams
 from app.api.markers import artwork, codebooks, markers, plates, searches
-from app.api.plans import alignments, plans, radio_checks
+from app.api.plans import alignments, plans
 from app.api.public_pages import damage_reports, pages
 from app.api.public_pages.forms import MAX_FIELD_BYTES, public_limits
 from app.api.public_pages.pages import FormLimits
-from app.api.surveys import surveys
 from app.control.metrics import ProcessMetrics
 from app.control.operations import OperatorCases
 from app.control.server import ControlServer
@@ -64,13 +63,12 @@ ROUTERS = (
     plates.print_grade_router,
     artwork.layout_router,
     artwork.program_router,
-    radio_checks.router,
+    plans.radio_router,
     alignments.router,
     plans.rule_router,
     plans.router,
     plans.proof_router,
     plans.package_router,
-    plans.job_router,
     jobs.router,
     jobs.file_router,
     jobs.webhook_router,

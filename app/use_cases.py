@@ -30,7 +30,7 @@ from app.services.plans.alignments import Alignments
 from app.services.plans.making import PlanMaking, PlanPreviews
 from app.services.plans.packages import Packages
 from app.services.plans.plans import Plans
-from app.services.plans.proofs import PlanJobs, Proofs
+from app.services.plans.proofs import Proofs
 from app.services.progress import AgencyEvents, AllJobs, JobFiles
 from app.services.public_pages.pages import FormTokens, PublicPages
 from app.services.public_pages.reports import DamageReports
@@ -91,7 +91,6 @@ class UseCases:
     # roads to plan and their plans
     alignments: Alignments
     packages: Packages
-    plan_jobs: PlanJobs
     plan_making: PlanMaking
     plan_previews: PlanPreviews
     plans: Plans

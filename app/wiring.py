@@ -57,7 +57,7 @@ from app.services.plans.alignments import Alignments
 from app.services.plans.making import PlanMaking, PlanPreviews
 from app.services.plans.packages import Packages
 from app.services.plans.plans import Plans
-from app.services.plans.proofs import PlanJobs, Proofs
+from app.services.plans.proofs import Proofs
 from app.services.ports import utc_now
 from app.services.progress import AgencyEvents, AllJobs, JobFiles
 from app.services.public_pages.pages import FormTokens, PublicPages
@@ -201,7 +201,6 @@ def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -
             database, clock, blobs, pool, accuracy_m=settings.crs_accuracy_m, idempotency_ttl=ttl
         ),
         packages=packages,
-        plan_jobs=PlanJobs(database),
         plan_making=plan_making,
         plan_previews=PlanPreviews(plans, plan_making),
         plans=plans,

@@ -12,8 +12,9 @@ from typing_extensions import TypedDict
 from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, PageSize, Text, Whole, use_case
 from app.api.http.permissions import ADMINS, EVERYBODY, OPERATORS, PUBLIC, Allowed
 from app.api.http.problems import problem_responses
-from app.api.http.responses import Time, created_response, document_response, json_response, page_response
+from app.api.http.responses import Time, document_response, json_response, page_response
 from app.api.http.routes import Router
+from app.api.jobs import queued_job
 from app.families.documents import StrictModel
 from app.registry.audit import EntryFilter
 from app.services.access.access import AGENCY_SCOPES, MAX_AGENCY_NAME, Access, Scope
@@ -26,8 +27,9 @@ from app.services.access.audit import (
     NewAgencyDocument,
     NewKeyDocument,
 )
-from app.services.access.audit_jobs import AuditVerifications, VerificationDocument, VerificationInput
+from app.services.access.audit_jobs import AuditVerifications, VerificationInput
 from app.services.access.keys import MAX_OVERLAP, Agencies, Keys, NewKey
+from app.services.progress import VerificationJob
 
 # === /v1/audit: the log of what changed an agency's part of the registry.
 
@@ -78,7 +80,7 @@ def list_audit_entries(
     ADMINS,
     status_code=202,
     responses=document_response(
-        VerificationDocument, 409, status=202, description="Queued; Location leads to its progress and result"
+        VerificationJob, 409, status=202, description="Queued; Location leads to its progress and result"
     ),
 )
 def post_verification(
@@ -91,25 +93,7 @@ def post_verification(
 
     Computes every hash of the agency's log and of its markers' versions again, as a job.
     """
-    document, replayed = verifications.request(caller, wanted, idempotency)
-    response = created_response(document, replayed, path="/v1/audit/verifications", status=202)
-    response.headers["Retry-After"] = "1"
-    return response
-
-
-@audit_router.get("/verifications/{verification_id}", ADMINS, responses=document_response(VerificationDocument, 404))
-def get_verification(
-    verification_id: Annotated[Identifier, Path(description="Id of the verification's job.")],
-    caller: Caller,
-    verifications: Annotated[AuditVerifications, use_case(lambda cases: cases.audit_verifications)],
-) -> Response:
-    """Get a verification of the audit log.
-
-    With its progress, and what it found once it is done.
-    """
-    document = verifications.get(caller, verification_id)
-    waiting = document["state"] in ("queued", "running")
-    return json_response(document, headers={"Retry-After": "1"} if waiting else None)
+    return queued_job(*verifications.request(caller, wanted, idempotency))
 
 
 # === /v1/keys: the keys of the agency, for its admins; those of operators, for operators.

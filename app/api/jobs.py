@@ -37,7 +37,7 @@ from app.families.documents import StrictModel
 from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState
 from app.services.access.access import Caller as CallerValue
 from app.services.ports import Clock
-from app.services.progress import AgencyEvents, AllJobs, EventPage, JobDocument, JobFiles, JobPage, job_document
+from app.services.progress import AgencyEvents, AllJobs, AnyJob, EventPage, JobDocument, JobFiles, JobPage, job_summary
 from app.services.surveys.exports import STREAMED, WHOLE
 from app.services.webhooks import (
     DeliveryDocument,
@@ -251,22 +251,25 @@ def list_jobs(
     dead_letter: Annotated[
         bool | None, Query(description="`true`: only jobs that stopped the processes that worked on them.")
     ] = None,
+    subject_id: Annotated[Identifier | None, Query(description="Jobs about this plan or reprocessing.")] = None,
     limit: PageSize = 100,
     after: LastId = None,
 ) -> Response:
     """List the jobs of an agency.
 
-    Of all kinds that the key may see, newest first.
+    Of all kinds that the key may see, without their results, newest first.
     """
-    page, last = jobs.page(caller, kind=kind, state=state, dead_letter=dead_letter, before=after, limit=limit)
+    page, last = jobs.page(
+        caller, kind=kind, state=state, dead_letter=dead_letter, subject_id=subject_id, before=after, limit=limit
+    )
     return page_response(request, page, after=last)
 
 
-@router.get("/{job_id}", EVERYBODY, responses=document_response(JobDocument, 404))
+@router.get("/{job_id}", EVERYBODY, responses=document_response(AnyJob, 404))
 def get_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
     """Get a job with its progress.
 
-    `links.result` leads to its result once it is done.
+    Once it is done it has its result, or `links.result` leads there. A refused import is done, too.
     """
     document = jobs.get(caller, job_id)
     waiting = document["state"] in UNFINISHED
@@ -274,7 +277,7 @@ def get_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
 
 
 # viewers cancel the artwork and exports that they asked for; app/services/progress.py lists the kinds of each scope
-@router.post("/{job_id}/cancel", EVERYBODY, responses=document_response(JobDocument, 404, 409))
+@router.post("/{job_id}/cancel", EVERYBODY, responses=document_response(AnyJob, 404, 409))
 def cancel_job(job_id: JobId, caller: Caller, jobs: Service) -> Response:
     """Cancel a job.
 
@@ -305,9 +308,9 @@ async def get_job_events(
 
     As server-sent events, until it ends: `done`, `total`, `rate_per_s` and `progress`.
 
-    The first event is the present state, and the last one has the name of the state in which the job ended, and the
-    whole job as data. With `Last-Event-ID`, what was seen is not sent again. Comments keep the connection open. A
-    stream ends after 15 minutes at the latest; clients connect again.
+    The first event is the present state, and the last one has the name of the state in which the job ended. The data of
+    each is the job without its result. With `Last-Event-ID`, what was seen is not sent again. Comments keep the
+    connection open. A stream ends after 15 minutes at the latest; clients connect again.
     """
     row = await to_thread.run_sync(jobs.row, caller, job_id)
     if row.state not in UNFINISHED and last_event_id == _event_id(row):
@@ -334,7 +337,7 @@ def _event_id(row: JobRow) -> str:
 
 def _event(follower: JobFollower, clock: Clock) -> ServerEvent:
     row = follower.row
-    document = job_document(row, clock())
+    document = job_summary(row, clock())
     if row.state in UNFINISHED:
         rate_per_s = follower.rate_per_s()
         if rate_per_s is not None:
@@ -453,9 +456,11 @@ async def _stream(
 def _number(last_event_id: str) -> int:
     if not (last_event_id.isascii() and last_event_id.isdigit()) or len(last_event_id) > _MAX_DIGITS:
         raise InvalidParameter(
-            f"{last_event_id[:40]!r} is no id of an event", field="Last-Event-ID", limit="the id of an event, a number",
+            f"{last_event_id[:40]!r} is no id of an event",
+            field="Last-Event-ID",
+            limit="the id of an event, a number",
             cure="send the id of the last event as it came",
-        )  # fmt: skip
+        )
     return int(last_event_id)
 
 

@@ -6,7 +6,7 @@ import base64
 import binascii
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from email.utils import format_datetime
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
@@ -55,7 +55,7 @@ class Checksum(NamedTuple):
     algorithm: str
     digest: bytes
 
-    def of(self, blocks: Any) -> bool:
+    def of(self, blocks: Iterable[bytes]) -> bool:
         """Whether bytes have it."""
         found = hashlib.new(ALGORITHMS[self.algorithm], usedforsecurity=False)
         for block in blocks:
@@ -272,7 +272,7 @@ _NO_CONTENT: Described = {204: {"description": "Done"}}
 _OPTIONS: Described = {200: {"description": "Tus-Version, Tus-Extension, Tus-Max-Size and Tus-Checksum-Algorithm"}}
 
 
-def _body(required: bool, **others: Any) -> dict[str, Any]:
+def _body(required: bool, **others: object) -> dict[str, Any]:
     return {"requestBody": {"required": required, "content": {BODY: {"schema": BINARY}, **others}}}
 
 

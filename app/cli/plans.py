@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -21,9 +20,10 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from rich.console import Console
 
+    from app.formats.surveys.declaration import Unit
     from app.markers.plate import PlateGeometry
     from app.markers.reading import PlateReading
-    from app.planning.outputs.package import OutputOptions
+    from app.planning.outputs.package import PackageOptions
     from app.planning.plan import Plan
 
 
@@ -73,8 +73,7 @@ def plan(
 
     from app.planning.alignment import AlignmentDeclaration
     from app.planning.outputs.drawing_sheet import TitleBlock
-    from app.planning.outputs.package import OutputOptions
-    from app.planning.outputs.strip_map import DrawingOptions
+    from app.planning.outputs.package import PackageOptions
 
     console = Console(stderr=True)
     with bad_input():
@@ -84,15 +83,16 @@ def plan(
             realization,
             epoch,
             vertical_datum and normalize_vertical_datum(vertical_datum),
-            unit,
+            cast("Unit | None", unit),
             None,
             ignore_heights,
             _origin(origin),
             bearing,
         )
         made = _make(console, road, rules, declaration, name or road.stem)
-        block = TitleBlock(owner, number, date, creator, approver)
-        options = OutputOptions(stakeout_crs, stakeout_unit, DrawingOptions(block, scale))
+        options = PackageOptions(
+            stakeout_crs, cast("Unit | None", stakeout_unit), scale, TitleBlock(owner, number, date, creator, approver)
+        )
         _write(console, made, out, options, artwork=artwork)
     _print(made, out)
 
@@ -146,15 +146,15 @@ def _make(console: Console, road: Path, rules_file: Path, declaration: object, n
     return made
 
 
-def _write(console: Console, made: Plan, out: Path, options: OutputOptions, *, artwork: bool) -> None:
+def _write(console: Console, made: Plan, out: Path, options: PackageOptions, *, artwork: bool) -> None:
     """All files, or none: they are moved into the folder when the last one is complete."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from app.encoders.packer import file_entry
-    from app.planning.outputs.package import MANIFEST, Package, PackageOptions, PartKind
+    from app.planning.outputs.package import MANIFEST, Package, PartKind
     from app.plots.track import draw_trade_off
 
-    package = Package(made, PackageOptions(replace(options, draw_trade_off=draw_trade_off)))
+    package = Package(made, options, draw_trade_off)
     out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
         parts = [part for part in package.parts() if artwork or part.kind is PartKind.FILE]

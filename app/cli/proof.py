@@ -47,7 +47,7 @@ def proof(
     from rich.progress import Progress as ProgressBar
 
     from app.cli.proof_runner import run_proof
-    from app.planning.proof.report import markers_csv, report_document
+    from app.planning.proof.report import markers_csv
 
     options = {
         "drives": drives, "seed": seed, "lost_share": lost, "speed_share": speed,
@@ -59,16 +59,21 @@ def proof(
         terms = _terms({name: value for name, value in options.items() if value is not None})
         if not (folder / _PLAN_FILE).is_file():
             raise InvalidParameter(
-                f"{folder} has no {_PLAN_FILE}", field="folder", limit="a folder with a plan",
+                f"{folder} has no {_PLAN_FILE}",
+                field="folder",
+                limit="a folder with a plan",
                 cure="make the plan with waymark plan ROAD --rules RULES --out FOLDER",
-            )  # fmt: skip
+            )
         with ProgressBar(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task("Driving", total=None)
             report = run_proof(
-                folder / _PLAN_FILE, terms, folder / _RESULTS_FILE, workers or os.cpu_count() or 1,
+                folder / _PLAN_FILE,
+                terms,
+                folder / _RESULTS_FILE,
+                workers or os.cpu_count() or 1,
                 lambda done, total: bar.update(task, completed=done, total=total),
-            )  # fmt: skip
-    (folder / "proof.json").write_bytes(orjson.dumps(report_document(report), option=orjson.OPT_INDENT_2))
+            )
+    (folder / "proof.json").write_bytes(report.write(orjson.OPT_INDENT_2))
     (folder / "proof.csv").write_text(markers_csv(report))
     _print(report, folder)
 
@@ -115,7 +120,7 @@ def _print(report: ProofReport, folder: Path) -> None:
         )  # fmt: skip
     console.print(drives)
     weak = Table("weak marker", "kind", "lane", "chainage", "read", "cause")
-    for marker in report.weak[:_SHOWN_WEAK]:
+    for marker in report.list_weak()[:_SHOWN_WEAK]:
         weak.add_row(
             str(marker.number), marker.kind, escape(marker.lane), f"{marker.chainage_m:.1f} m",
             f"{marker.read} of {marker.passes}", marker.cause or "-",

@@ -55,11 +55,11 @@ def import_survey(
     """Import a survey and print the report as JSON, also while the server runs. The exit status is 1 if refused."""
     import orjson
 
-    from app.api.surveys.schemas import DeclarationIn
+    from app.services.surveys.import_report import DeclarationIn
 
     declaration = read_declaration(DeclarationIn, declared, "docs/imports.md")
     declaration = declaration.model_copy(update={"dry_run": dry_run or declaration.dry_run})
-    values = {"agency": agency, "declaration": declaration.declared()}
+    values = {"agency": agency, "declaration": declaration.model_dump(mode="json")}
     with survey.open("rb") as file:
         report = perform(read_settings(), "import", values, (file.fileno(),), quiet=as_json)["report"]
     shown: dict[str, object] = {**report}

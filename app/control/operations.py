@@ -67,14 +67,14 @@ def create_key(cases: OperatorCases, values: Values, _files: Sequence[int], _rep
 
 def import_survey(cases: OperatorCases, values: Values, files: Sequence[int], report: Report) -> Values:
     """Import the survey in the first file."""
-    from app.services.surveys.import_report import import_input
+    from app.services.surveys.import_report import DeclarationIn, import_input
     from app.services.surveys.imports import SETTLED
 
     with TemporaryDirectory(prefix="waymark-import-") as folder, operator(cases.database, values["agency"]) as caller:
         survey = Path(folder, "survey")  # decoder processes open it by its path, and not all paths are theirs
         with os.fdopen(os.dup(files[0]), "rb") as given_file, survey.open("xb") as copy:
             shutil.copyfileobj(given_file, copy, _CHUNK_BYTES)
-        given = import_input(values["declaration"], SpooledFile.at(survey))
+        given = import_input(DeclarationIn.model_validate(values["declaration"]), SpooledFile.at(survey))
         found, _ = cases.imports().run(
             caller, given, step=lambda done: report("check", done / SETTLED, 1.0), stored=partial(report, "store")
         )

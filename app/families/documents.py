@@ -5,13 +5,13 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal, NotRequired
 
-from pydantic import AfterValidator, BaseModel, Field, JsonValue
+from pydantic import BaseModel, Field, JsonValue
 from typing_extensions import ReadOnly, TypedDict
 
-from app.errors import InvalidParameter, ReferenceSystemError
+from app.errors import InvalidParameter
 from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
-from app.geodesy.systems import normalize_vertical_datum
+from app.geodesy.systems import VerticalDatum as VerticalDatum
 from app.inputs import Flag as Flag
 from app.inputs import Identifier as Identifier
 from app.inputs import Number as Number
@@ -127,15 +127,6 @@ def marker_place(row: MarkerRow) -> MarkerPlace:
 # === Schemas of requests that register or change markers: what every family shares.
 
 
-def _vertical_datum(text: str) -> str:
-    try:
-        return normalize_vertical_datum(text)
-    except ReferenceSystemError as error:
-        error.field = None  # the place in the request is
-        raise
-
-
-VerticalDatum = Annotated[Text, Field(min_length=1, max_length=64), AfterValidator(_vertical_datum)]
 VersionKind = Literal["as-planned", "as-built", "resurvey", "correction", "change"]
 Heading = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, lt=360)]
 Accuracy = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6)]

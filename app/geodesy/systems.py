@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import AfterValidator, Field
 from pyproj import CRS, Transformer
 from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, ReferenceSystemError
+from app.inputs import Text
 
 WGS84 = "EPSG:4326"
 _GLOBAL_DATUM = re.compile(
@@ -288,6 +290,17 @@ def normalize_vertical_datum(text: str) -> str:
             cure="send ellipsoid, EPSG:5703 (NAVD88), EPSG:7837 (DHHN2016), EPSG:3855 (EGM2008), ...",
         )
     return f"EPSG:{int(code)}"
+
+
+def _vertical_datum(text: str) -> str:
+    try:
+        return normalize_vertical_datum(text)
+    except ReferenceSystemError as error:
+        error.field = None  # the place in the request is
+        raise
+
+
+VerticalDatum = Annotated[Text, Field(min_length=1, max_length=64), AfterValidator(_vertical_datum)]
 
 
 @lru_cache(maxsize=256)

@@ -481,9 +481,7 @@ class Meaning:
     value: Annotated[
         SkipValidation[float | str],
         WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string", "maxLength": 80}]}),
-        Field(
-            description="A number in the kind's unit, the arrow, or the text of the notice, 1 to 80 printable characters."
-        ),
+        Field(description="A number in the kind's unit, the arrow, or the text of the notice: 1 to 80 characters."),
     ]
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, ClassVar, Literal, get_args
@@ -86,7 +87,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RadioFinding(ComparedFigure):
-    """One check of a radio plan, which may end between passed and failed; `sentence` gives the result for people."""
+    """One check of a radio plan, which may end between passed and failed: its figure, the limit, and what follows."""
 
     verdict: Verdict
     sentence: str
@@ -95,6 +96,12 @@ class RadioFinding(ComparedFigure):
     def passed(self) -> bool:
         """Whether nothing is wrong."""
         return self.verdict is Verdict.OK
+
+
+def worst_verdict(findings: Iterable[RadioFinding]) -> Verdict:
+    """The worst verdict of all findings."""
+    found = {finding.verdict for finding in findings}
+    return next((verdict for verdict in (Verdict.FAIL, Verdict.WARN) if verdict in found), Verdict.OK)
 
 
 def at_most(

@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, with_config
 from pyproj import Geod
 
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import BoundaryStyle, EventKind, StationEquation
-from app.formats.surveys.declaration import METRES
+from app.formats.surveys.declaration import METRES, Unit
 from app.geodesy import LocalizationGrade, check_lon_lat, grade_accuracy
+from app.geodesy.systems import VerticalDatum
+from app.inputs import INPUT, Flag, Number, Text
 
 # === What is declared of a file with a road, as for surveys: CRS, realization, epoch, heights, units, or an origin.
 
@@ -22,27 +26,33 @@ MAX_EPOCH = (1900.0, 2100.0)
 """Plausible coordinate epochs. [decimal year]"""
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class AlignmentDeclaration:
-    """What is declared of a file with a road.
+    """What is declared of a file with a road; what the file states may be left out."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is not allowed, or both a CRS and an origin are declared.
-    """
-
-    crs: str | None = None  # CRS of the coordinates; one that contradicts the file is an error
-    realization: str | None = None  # frame, e.g. ``ITRF2014``.
-    epoch: float | None = None  # [decimal year] coordinate epoch
-    # ``ellipsoid``, or the datum of the heights, e.g. ``EPSG:5703``; needed where a file with a CRS has heights.
-    vertical_datum: str | None = None
-    # `unit`, `height_unit`: ``m``, ``ft-us`` or ``ft-intl``; those of the file or of its CRS without
-    unit: str | None = None
-    height_unit: str | None = None
-    ignore_heights: bool = False  # leave heights out
-    origin: tuple[float, float] | None = None  # [deg] longitude and latitude of the origin of local coordinates
-    bearing_deg: float = 0.0  # [deg] direction of the local y axis, clockwise from true north; only with `origin`
+    # one that contradicts the file is an error
+    crs: Annotated[Text | None, Field(max_length=64, examples=["EPSG:25832"])] = None
+    realization: Annotated[Text | None, Field(max_length=64, examples=["ITRF2014"])] = None
+    epoch: Annotated[Number | None, Field(ge=MAX_EPOCH[0], le=MAX_EPOCH[1], description="Decimal year.")] = None
+    vertical_datum: Annotated[
+        VerticalDatum | None,
+        Field(
+            examples=["ellipsoid"],
+            description="`ellipsoid`, or the datum of the heights; needed where a file with a CRS has heights.",
+        ),
+    ] = None
+    # `unit`, `height_unit`: those of the file or of its CRS without
+    unit: Unit | None = None
+    height_unit: Unit | None = None
+    ignore_heights: Flag = False
+    origin: Annotated[
+        tuple[Number, Number] | None,
+        Field(description="Longitude and latitude of the origin of local coordinates. Such a road is not surveyed."),
+    ] = None
+    bearing_deg: Annotated[
+        Number, Field(ge=-360, le=360, description="Direction of the local y axis; only with `origin`. [deg]")
+    ] = 0.0
 
     def __post_init__(self) -> None:
         for field, value in (("unit", self.unit), ("height_unit", self.height_unit)):

@@ -16,7 +16,7 @@ from app.markers.cerpm import LaneSide, SpeedLimit
 from app.markers.magnet import InformationTag, LineTag
 from app.markers.magnet_design import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry
-from app.markers.reading import ComparedFigure, Verdict
+from app.markers.reading import RadioFinding
 from app.planning.alignment import Alignment, RoadEvent
 from app.planning.rules import PlanRules, Quality
 from app.radio.settings import RadioSettings
@@ -146,11 +146,9 @@ class LeftOut:
 
 
 @dataclass(frozen=True, slots=True)
-class PlanFinding(ComparedFigure):
-    """One check of a plan, at its worst place."""
+class PlanFinding(RadioFinding):
+    """One check of a plan, at its worst place; `sentence` has the cure if it is not met."""
 
-    verdict: Verdict
-    sentence: str  # the result for people, with the cure if it is not met
     # `lane`, `station_m`, `lon_deg`, `lat_deg`: where the figure was found; None for figures of the whole plan
     lane: str | None = None
     station_m: float | None = None

@@ -13,9 +13,12 @@ from app.sensors.camera import Camera
 def camera_of(rules: CameraRules) -> Camera:
     """The camera that rules describe."""
     return Camera.from_field_of_view(
-        rules.width_px, rules.height_px, rules.horizontal_fov_deg, height_m=rules.height_m,
+        rules.width_px,
+        rules.height_px,
+        rules.horizontal_fov_deg,
+        height_m=rules.height_m,
         depression_deg=rules.depression_deg,
-    )  # fmt: skip
+    )
 
 
 def project_road(

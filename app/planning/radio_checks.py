@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
-from app.errors import InvalidParameter
+from app.errors import InvalidParameter, naming
+from app.inputs import Number, Whole
 from app.markers.cerpm import MESSAGE_BYTES
-from app.markers.reading import RadioFinding, Verdict, at_least
+from app.markers.reading import RadioFinding, Verdict, at_least, worst_verdict
 from app.planning.magnet_checks import DECELERATION_M_S2, REACTION_S, reaction_distance_m
 from app.radio.link import LinkModel
 from app.radio.reception import (
@@ -47,19 +50,12 @@ _STATION_STEP_M = 5.0  # [m]
 
 @dataclass(frozen=True, slots=True)
 class PreviewRule:
-    """Distance ahead at which a marker must have been read.
+    """How far ahead a marker must have been read: by default where the vehicle stops, and at least 31 m."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside its limits.
-    """
-
-    # [m] fixed, 1 to 2,000. By default it is the distance in which the vehicle stops, and at least the camera's 31 m.
-    distance_m: float | None = None
+    distance_m: Annotated[Number | None, Field(description="Fixed, 1 to 2,000. [m]")] = None
     # `reaction_s`, `deceleration_m_s2`: of the driver or the system; by default AASHTO Green Book (2018), 3.2.2
-    reaction_s: float = REACTION_S
-    deceleration_m_s2: float = DECELERATION_M_S2
+    reaction_s: Annotated[Number, Field(description="0 to 10. [s]")] = REACTION_S
+    deceleration_m_s2: Annotated[Number, Field(description="0.5 to 10. [m/s2]")] = DECELERATION_M_S2
 
     def __post_init__(self) -> None:
         if self.distance_m is not None:
@@ -75,36 +71,42 @@ class PreviewRule:
 
 
 @dataclass(frozen=True, slots=True)
+class EvenRoad:
+    """A long road with markers at even distances."""
+
+    spacing_m: Annotated[Number, Field(description="1 to 1,000. [m]")] = SPACING_M
+    sides: Annotated[Whole, Field(description="Sides of the lane with markers: 1 or 2.")] = 2
+    lane_width_m: Annotated[Number, Field(description="1 to 20. [m]")] = LANE_WIDTH_M
+
+    def __post_init__(self) -> None:
+        self.markers(0.0)
+
+    def markers(self, reach_m: float) -> RoadMarkers:
+        """The markers in reach of a receiver."""
+        with naming("road"):
+            return RoadMarkers.evenly(self.spacing_m, reach_m, sides=self.sides, lane_width_m=self.lane_width_m)
+
+
+@dataclass(frozen=True, slots=True)
 class RadioPlan:
-    """Markers along a road, their radios, and the requirements.
+    """Markers along a road, their radios, and the requirements."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside its limits.
-    """
-
-    settings: RadioSettings
+    radio: RadioSettings = field(default_factory=RadioSettings)
     region: Region = Region.US915
-    # `spacing_m`, `sides`, `lane_width_m`: of a long road with markers at even distances on one or two sides; used
-    # without `markers`. 1 to 1,000 m; 1 or 2; 1 to 20 m.
-    spacing_m: float = SPACING_M
-    sides: int = 2
-    lane_width_m: float = LANE_WIDTH_M
-    markers: RoadMarkers | None = None  # their positions
-    design_speed_m_s: float = 13.4  # [m/s] 0.5 to 70
+    road: EvenRoad = field(default_factory=EvenRoad)
+    markers: Annotated[RoadMarkers | None, Field(description="In place of `road`: where each is.")] = None
+    design_speed_m_s: Annotated[Number, Field(description="0.5 to 70. [m/s]")] = 13.4
     preview: PreviewRule = field(default_factory=PreviewRule)
     link: LinkModel = field(default_factory=LinkModel)
     receiver: Receiver = field(default_factory=Receiver)
     battery: Battery = field(default_factory=Battery)
-    min_probability: float = 0.99  # that a marker is read before the preview distance, 0.5 to 0.9999
-    min_battery_days: float = 365.0  # [day] 0 to 36,500
+    min_probability: Annotated[Number, Field(description="That a marker is read in time, 0.5 to 0.9999.")] = 0.99
+    min_battery_days: Annotated[Number, Field(description="0 to 36,500. [day]")] = 365.0
 
     def __post_init__(self) -> None:
         check_between("design_speed_m_s", self.design_speed_m_s, 0.5, 70.0, "m/s")
         check_between("min_probability", self.min_probability, 0.5, 0.9999, "")
         check_between("min_battery_days", self.min_battery_days, 0.0, 36_500.0, "days")
-        RoadMarkers.evenly(self.spacing_m, 0.0, sides=self.sides, lane_width_m=self.lane_width_m)
 
     @property
     def preview_m(self) -> float:
@@ -114,34 +116,29 @@ class RadioPlan:
     @property
     def air(self) -> Air:
         """Everything that determines whether a packet is read."""
-        return Air(self.settings, self.link, self.receiver)
+        return Air(self.radio, self.link, self.receiver)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RadioCheck:
-    """Results of checking a radio plan."""
+    """The result of checking a radio plan."""
 
+    verdict: Verdict  # the worst of all checks
     # `time_on_air_s`, `range_m`, `preview_m`: of a packet; distance at which its mean level falls to the receiver's
     # sensitivity; distance ahead at which a marker must have been read
     time_on_air_s: float
     range_m: float
     preview_m: float
-    # markers in range and share of packets read at points of the road; one spacing of it where it is even
-    road: RoadReception
+    road: RoadReception  # one spacing of it where it is even
     packet_success: float  # share of a marker's packets read at the preview distance, minimum over the road's markers
     read_probability: float  # that a marker is read in time, minimum over the road's markers
     battery_days: float  # [day]
     checks: tuple[RadioFinding, ...]
-
-    @property
-    def verdict(self) -> Verdict:
-        """The worst of all checks."""
-        found = {check.verdict for check in self.checks}
-        return next((v for v in (Verdict.FAIL, Verdict.WARN) if v in found), Verdict.OK)
+    recommendation: Recommendation | None = None  # if it was asked for
 
 
-def check_radio(plan: RadioPlan) -> RadioCheck:
-    """Check a radio plan: law, link, collisions, reading in time, battery.
+def check_radio(plan: RadioPlan, *, recommend: bool = False) -> RadioCheck:
+    """Check a radio plan: law, link, collisions, reading in time, battery; and recommend settings if asked to.
 
     Raises
     ------
@@ -159,26 +156,36 @@ def check_radio(plan: RadioPlan) -> RadioCheck:
     probability = min(read_probability(one, plan.design_speed_m_s, air) for one in approaches)
     success = min(_success_at_preview(one, air) for one in approaches)
     road = road_reception(markers, _stations(plan, markers), air)
-    days = battery_life_days(plan.settings, plan.battery)
+    days = battery_life_days(plan.radio, plan.battery)
     checks = (
-        *check_legal(plan.settings, plan.region),
-        *check_transmitter(plan.settings),
+        *check_legal(plan.radio, plan.region),
+        *check_transmitter(plan.radio),
         *_lorawan_room(plan),
         _level(plan),
         _channels(plan),
-        _jitter(plan.settings),
-        _probability(plan, probability, success, int(road.in_range.max())),
+        _jitter(plan.radio),
+        _probability(plan, probability, success, max(road.markers_in_range)),
         _battery(plan, days),
     )
-    return RadioCheck(plan.settings.time_on_air_s, air.range_m, preview_m, road, success, probability, days, checks)
+    return RadioCheck(
+        worst_verdict(checks),
+        plan.radio.time_on_air_s,
+        air.range_m,
+        preview_m,
+        road,
+        success,
+        probability,
+        days,
+        checks,
+        recommend_settings(plan) if recommend else None,
+    )
 
 
 def markers_of(plan: RadioPlan) -> tuple[RoadMarkers, list[int]]:
     """Markers of a plan, and the indices of those to check."""
     if plan.markers is None:
         reach_m = plan.air.reach_m + plan.air.harm_m
-        even = RoadMarkers.evenly(plan.spacing_m, reach_m, sides=plan.sides, lane_width_m=plan.lane_width_m)
-        return even, [0]
+        return plan.road.markers(reach_m), [0]
     count = len(plan.markers.chainage_m)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).round().astype(int))
     return plan.markers, np.argsort(plan.markers.chainage_m, kind="stable")[chosen].tolist()
@@ -187,7 +194,7 @@ def markers_of(plan: RadioPlan) -> tuple[RoadMarkers, list[int]]:
 def _stations(plan: RadioPlan, markers: RoadMarkers) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Stations to check: within one spacing of an even road, otherwise every 5 m, and 200 in all at most."""
     if plan.markers is None:
-        return np.linspace(0.0, plan.spacing_m, 5)
+        return np.linspace(0.0, plan.road.spacing_m, 5)
     low, high = float(markers.chainage_m.min()), float(markers.chainage_m.max())
     most = min(_STATIONS, _STATION_MARKERS // len(markers.chainage_m))
     return np.linspace(low, high, min(most, 1 + math.ceil((high - low) / _STATION_STEP_M)))
@@ -201,9 +208,9 @@ def _success_at_preview(reception: Approach, air: Air) -> float:
 
 def _lorawan_room(plan: RadioPlan) -> tuple[RadioFinding, ...]:
     """Whether LoRaWAN has a data rate of these settings, with room for the message."""
-    if not plan.settings.lorawan:
+    if not plan.radio.lorawan:
         return ()
-    modulation = (plan.settings.spreading_factor, plan.settings.bandwidth_hz)
+    modulation = (plan.radio.spreading_factor, plan.radio.bandwidth_hz)
     room = next(
         (r.payload_bytes for r in DATA_RATES[plan.region] if (r.spreading_factor, r.bandwidth_hz) == modulation), 0
     )
@@ -213,7 +220,7 @@ def _lorawan_room(plan: RadioPlan) -> tuple[RadioFinding, ...]:
 
 def _level(plan: RadioPlan) -> RadioFinding:
     air = plan.air
-    level_dbm = float(air.level_dbm(math.hypot(plan.preview_m, plan.lane_width_m / 2)))
+    level_dbm = float(air.level_dbm(math.hypot(plan.preview_m, plan.road.lane_width_m / 2)))
     margin_db = level_dbm - air.threshold_dbm
     return at_least(
         "link-margin",
@@ -227,7 +234,7 @@ def _level(plan: RadioPlan) -> RadioFinding:
 
 
 def _channels(plan: RadioPlan) -> RadioFinding:
-    sent, received = plan.settings.channels, plan.receiver.channels
+    sent, received = plan.radio.channels, plan.receiver.channels
     return at_least(
         "receiver-channels",
         min(received, sent),
@@ -286,15 +293,15 @@ _WANTED = 8  # markers that are approached; bounds the time of the search
 
 @dataclass(frozen=True, slots=True)
 class Recommendation:
-    """The best lawful settings found for a plan."""
+    """The best lawful settings that were found."""
 
     # those with the longest battery life that reach the required probability; if none does, those with the highest
-    # probability. None if no settings are lawful.
-    settings: RadioSettings | None
+    # probability
+    radio: Annotated[RadioSettings | None, Field(description="Null where nothing is lawful.")]
     receiver_channels: int  # channels that the receiver must receive at the same time
     read_probability: float
     battery_days: float  # [day]
-    reaches: bool  # whether the required probability is reached
+    reaches: Annotated[bool, Field(description="Whether the probability asked for is reached.")]
     sentence: str  # for people
 
 
@@ -319,14 +326,14 @@ def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recomm
     """
     approaches = _ApproachesByLink(plan)
     best = _best(plan, approaches)
-    if best.reaches or not more_channels or plan.settings.hopping:
+    if best.reaches or not more_channels or plan.radio.hopping:
         return best
     for channels in MORE_CHANNELS:
-        if channels <= plan.settings.channels:
+        if channels <= plan.radio.channels:
             continue
         wider = replace(
             plan,
-            settings=replace(plan.settings, channels=channels),
+            radio=replace(plan.radio, channels=channels),
             receiver=replace(plan.receiver, channels=max(channels, plan.receiver.channels)),
         )
         found = _best(wider, approaches)
@@ -359,12 +366,12 @@ def _modulations(plan: RadioPlan) -> Iterator[RadioSettings]:
     """Settings with the longest interval: one for each spreading factor, bandwidth and power that may be lawful."""
     room = {(r.spreading_factor, r.bandwidth_hz) for r in DATA_RATES[plan.region] if r.payload_bytes >= MESSAGE_BYTES}
     for bandwidth_hz in BANDWIDTHS_HZ:
-        for spreading_factor in SPREADING_FACTORS[1 if plan.settings.explicit_header else 0 :]:
-            if plan.settings.lorawan and (spreading_factor, bandwidth_hz) not in room:
+        for spreading_factor in SPREADING_FACTORS[1 if plan.radio.explicit_header else 0 :]:
+            if plan.radio.lorawan and (spreading_factor, bandwidth_hz) not in room:
                 continue
             for power_dbm in POWERS_DBM:
                 settings = replace(
-                    plan.settings,
+                    plan.radio,
                     spreading_factor=spreading_factor,
                     bandwidth_hz=bandwidth_hz,
                     power_dbm=power_dbm,
@@ -395,7 +402,7 @@ class _ApproachesByLink:
 
     def find(self, settings: RadioSettings) -> list[Approach]:
         """Approaches with these settings; none where more markers are in range than a check allows."""
-        plan = replace(self._plan, settings=settings)
+        plan = replace(self._plan, radio=settings)
         key = plan.air.threshold_dbm, settings.power_dbm
         if key not in self._found:
             try:

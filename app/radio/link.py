@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 import scipy
+from pydantic import Field
 
+from app.inputs import Number
 from app.radio.settings import check_between, check_modulation
 
 Floats = npt.NDArray[np.float64]
@@ -43,25 +46,18 @@ def sensitivity_dbm(spreading_factor: int, bandwidth_hz: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class LinkModel:
-    """Path loss over the logarithm of distance.
+    """Path loss over the logarithm of distance: by default the line through the CERPM paper's two points, and 4 dB of
+    fading, which the paper does not give."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside its limits.
-
-    Notes
-    -----
-    By default the line through the CERPM paper's two points, with a fading of 4 dB, which the paper does not give.
-    """
-
-    # `near_m`, `near_dbm`: a distance and the mean level there
-    near_m: float = NEAR_M
-    near_dbm: float = NEAR_DBM
-    exponent: float = EXPONENT  # 1 to 6
-    at_power_dbm: float = PAPER_POWER_DBM  # [dBm] the power that was sent then
-    # [dB] standard deviation of a packet's level about the mean, 0 to 15; each packet fades by itself
-    fading_db: float = FADING_DB
+    near_m: Annotated[Number, Field(description="A distance, 1 to 10,000. [m]")] = NEAR_M
+    near_dbm: Annotated[Number, Field(description="The mean level there, -150 to 0. [dBm]")] = NEAR_DBM
+    exponent: Annotated[Number, Field(description="1 to 6.")] = EXPONENT
+    at_power_dbm: Annotated[Number, Field(description="The power that was sent then, -20 to 30. [dBm]")] = (
+        PAPER_POWER_DBM
+    )
+    fading_db: Annotated[
+        Number, Field(description="Standard deviation of a packet's level, 0 to 15; each fades by itself. [dB]")
+    ] = FADING_DB
 
     def __post_init__(self) -> None:
         check_between("link.near_m", self.near_m, 1.0, 10_000.0, "m")

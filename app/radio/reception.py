@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, GetPydanticSchema
 
 from app.errors import InvalidParameter
+from app.inputs import Flag, Number, Whole
 from app.radio.link import LinkModel, sensitivity_dbm
 from app.radio.settings import MAX_CHANNELS, RadioSettings, check_between, check_whole
 
@@ -26,18 +28,18 @@ _BIN = 0.02  # standard deviations of fading between the levels of `_binned`; so
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """The receiver in the vehicle.
+    """The vehicle's receiver."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside its limits.
-    """
-
-    channels: int = 1  # that it receives at the same time; 1 for an SX1276, 8 for a gateway's chip
-    sensitivity_dbm: float | None = None  # [dBm] -150 to -60; the SX1276's by default
-    capture_db: float | None = CAPTURE_DB  # [dB] 0 to 30; None where every overlap loses both packets
-    relocks: bool = False  # whether it abandons a weak packet for a stronger one that begins later. An SX1276 does not.
+    channels: Annotated[Whole, Field(description="Channels received at once: 1 for an SX1276, 8 for a gateway.")] = 1
+    sensitivity_dbm: Annotated[Number | None, Field(description="-150 to -60; the chip's own if left out. [dBm]")] = (
+        None
+    )
+    capture_db: Annotated[
+        Number | None, Field(description="By which a packet outdoes others, 0 to 30; null for none. [dB]")
+    ] = CAPTURE_DB
+    relocks: Annotated[
+        Flag, Field(description="It abandons a weak packet for a stronger one that begins later; an SX1276 does not.")
+    ] = False
 
     def __post_init__(self) -> None:
         check_whole("receiver.channels", self.channels, 1, MAX_CHANNELS, "")
@@ -211,18 +213,23 @@ _TRANSMISSIONS = 1_000  # on an approach, each by itself; source: 25 between two
 _PHASES = 32  # of the transmissions on the approach
 
 
+_Places = Annotated[
+    Floats,
+    GetPydanticSchema(
+        lambda _, schema_of: schema_of(Annotated[list[Number], Field(min_length=1, max_length=MAX_MARKERS)])
+    ),
+]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadMarkers:
-    """Positions of markers along a road.
+    """Where markers stand along a road, in any order: lists of one length."""
 
-    Raises
-    ------
-    InvalidParameter
-        Lengths differ, a value is not finite, or there are none or more than 20,000.
-    """
-
-    chainage_m: Floats  # shape (M,): [m] along the road, rising in the direction of travel; in any order
-    offset_m: Floats  # shape (M,): [m] from the receiver's path, left positive, within 100 m
+    # shape (M,)
+    chainage_m: Annotated[_Places, Field(description="Along the road, rising in the direction of travel. [m]")]
+    offset_m: Annotated[
+        _Places, Field(description="From the receiver's path, left positive, -100 to 100. [m]")
+    ]  # shape (M,)
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -337,14 +344,13 @@ def reception_at(markers: RoadMarkers, station_m: float, air: Air) -> StationRec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadReception:
-    """Reception along a road."""
+    """Reception at points along the road; null where no marker is in range."""
 
-    station_m: Floats  # shape (S,) [m]
-    in_range: npt.NDArray[np.intp]  # shape (S,): number of markers in range
-    # `success_mean`, `success_min`: shape (S,): share of packets read, mean and minimum over the markers in range; NaN
-    # if there are none
-    success_mean: Floats
-    success_min: Floats
+    station_m: list[float]
+    markers_in_range: list[int]
+    # share of packets that are read, over the markers in range
+    packet_success_mean: list[float | None]
+    packet_success_min: list[float | None]
 
 
 def road_reception(markers: RoadMarkers, stations_m: npt.ArrayLike, air: Air) -> RoadReception:
@@ -357,14 +363,13 @@ def road_reception(markers: RoadMarkers, stations_m: npt.ArrayLike, air: Air) ->
     """
     stations = np.atleast_1d(np.asarray(stations_m, float))
     check_whole("stations_m", len(stations), 1, MAX_STATIONS, "stations")
-    in_range = np.zeros(len(stations), np.intp)
-    mean, lowest = np.full(len(stations), math.nan), np.full(len(stations), math.nan)
-    for i, station_m in enumerate(stations):
-        success = reception_at(markers, float(station_m), air).success
-        in_range[i] = len(success)
-        if len(success):
-            mean[i], lowest[i] = success.mean(), success.min()
-    return RoadReception(stations, in_range, mean, lowest)
+    road = RoadReception(stations.tolist(), [], [], [])
+    for station_m in road.station_m:
+        success = reception_at(markers, station_m, air).success
+        road.markers_in_range.append(len(success))
+        road.packet_success_mean.append(float(success.mean()) if len(success) else None)
+        road.packet_success_min.append(float(success.min()) if len(success) else None)
+    return road
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -277,26 +277,26 @@ _TRANSMIT_MA = ((7.0, 20.0), (13.0, 29.0), (17.0, 87.0), (20.0, 120.0))  # [dBm,
 
 @dataclass(frozen=True, slots=True)
 class Battery:
-    """A marker's battery and its loads.
+    """The marker's battery and its loads."""
 
-    Raises
-    ------
-    InvalidParameter
-        A value is outside its limits.
-    """
-
-    capacity_mah: float = CAPACITY_MAH  # [mAh] 10 to 1,000,000
-    # share left by cold, age and self-discharge, 0.1 to 1
-    usable_share: float = 0.8  # source: assumed, no measurement kept
-    # [mA] whole marker between packets, 0 to 1,000. The default is the maker's figure for the paper's board (WiFi LoRa
-    # 32, deep sleep); a purpose-built board needs a hundredth.
-    sleep_ma: float = 0.8  # [mA] source: the maker's figure for the WiFi LoRa 32, deep sleep
-    # `awake_ma`, `awake_s`: [s] its processor while it makes a packet, and the time for that besides the time on air:
-    # assumed. [mA],
-    awake_ma: float = 40.0  # [mA] source: assumed, no measurement kept
-    awake_s: float = 0.01  # [s] source: assumed, no measurement kept
-    # [mA] radio while it sends, 1 to 1,000; by the SX1276's data sheet from the power by default
-    transmit_ma: float | None = None
+    capacity_mah: Annotated[Number, Field(description="10 to 1,000,000. [mAh]")] = CAPACITY_MAH
+    usable_share: Annotated[  # source: assumed, no measurement kept
+        Number, Field(description="Of the capacity, left by cold, age and self-discharge, 0.1 to 1.")
+    ] = 0.8
+    # source: the maker's figure for the paper's board, the WiFi LoRa 32 in deep sleep
+    sleep_ma: Annotated[
+        Number,
+        Field(
+            description="Between transmissions, 0 to 1,000; by default of the paper's board, a purpose-built one needs "
+            "a hundredth. [mA]"
+        ),
+    ] = 0.8
+    # `awake_ma`, `awake_s`: source: assumed, no measurement kept
+    awake_ma: Annotated[Number, Field(description="Of the processor while it makes a packet, 0 to 1,000. [mA]")] = 40.0
+    awake_s: Annotated[Number, Field(description="For each packet, besides its time on air, 0 to 10. [s]")] = 0.01
+    transmit_ma: Annotated[
+        Number | None, Field(description="While it sends, 1 to 1,000; by the power and the SX1276's data sheet. [mA]")
+    ] = None
 
     def __post_init__(self) -> None:
         check_between("battery.capacity_mah", self.capacity_mah, 10.0, 1e6, "mAh")

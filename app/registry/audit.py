@@ -335,7 +335,8 @@ _PAGE = 5_000  # rows of a walk in memory at the same time; a few megabytes
 _NO_VERSIONS = hashlib.sha256().hexdigest()
 
 
-class Fault(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class AuditFault:
     """Something that is not as it was written: where, and what is wrong."""
 
     where: str
@@ -368,7 +369,7 @@ def check_history(
     report: ChainReport,
     expected_head: tuple[int, str] | None = None,
     verified_head: tuple[int, str] | None = None,
-) -> Iterator[Fault]:
+) -> Iterator[AuditFault]:
     """Faults of an agency's audit log, of its markers' versions, and of markers that differ from their last version.
 
     Parameters
@@ -407,7 +408,7 @@ def _plan_for_all_rows(connection: sa.Connection) -> None:
 
 def _check_log(
     connection: sa.Connection, agency_id: str, report: ChainReport, expected_head: tuple[int, str] | None
-) -> Iterator[Fault]:
+) -> Iterator[AuditFault]:
     number, previous = report.head or (0, NO_ENTRY)
     if number:
         yield from _check_verified(connection, agency_id, number, previous)
@@ -419,11 +420,13 @@ def _check_log(
         entry = EntryRow._make(row)
         where = f"entry {entry.number}"
         if entry.number != number + 1:
-            yield Fault(_span("entry", "entries", number + 1, entry.number - 1), "missing")
+            yield AuditFault(_span("entry", "entries", number + 1, entry.number - 1), "missing")
         elif entry.previous_hash != previous:
-            yield Fault(where, "does not name the hash of the entry before it: one of the two was replaced or moved")
+            yield AuditFault(
+                where, "does not name the hash of the entry before it: one of the two was replaced or moved"
+            )
         if content_sha256(entry[:-1]) != entry.hash:
-            yield Fault(where, "changed: its hash does not match its content")
+            yield AuditFault(where, "changed: its hash does not match its content")
         while group is not None and group.number < entry.number:
             yield _uncovered(group)
             group = next(covered, None)
@@ -433,7 +436,7 @@ def _check_log(
         else:
             yield from _compare(entry, 0, _NO_VERSIONS)
         if expected_head is not None and entry.number == expected_head[0] and entry.hash != expected_head[1]:
-            yield Fault(where, "its hash is not the one that was expected: the history up to it was rewritten")
+            yield AuditFault(where, "its hash is not the one that was expected: the history up to it was rewritten")
         number, previous = entry.number, entry.hash
         report.count(entries=1)
         report.head = (number, previous)
@@ -441,17 +444,17 @@ def _check_log(
         yield _uncovered(group)
         group = next(covered, None)
     if expected_head is not None and number < expected_head[0]:
-        yield Fault(f"entry {expected_head[0]}", "expected, but the log ends before it: its end was cut off")
+        yield AuditFault(f"entry {expected_head[0]}", "expected, but the log ends before it: its end was cut off")
 
 
-def _check_verified(connection: sa.Connection, agency_id: str, number: int, expected_hash: str) -> Iterator[Fault]:
+def _check_verified(connection: sa.Connection, agency_id: str, number: int, expected_hash: str) -> Iterator[AuditFault]:
     """Whether the entry at which an earlier check ended is there as it was."""
     own = (audit_log.c.agency_id == agency_id, audit_log.c.number == number)
     found = connection.execute(select_rows(EntryRow, audit_log).where(*own)).one_or_none()
     if found is None:
-        yield Fault(f"entry {number}", "missing, and an earlier check ended with it")
+        yield AuditFault(f"entry {number}", "missing, and an earlier check ended with it")
     elif content_sha256(tuple(found)[:-1]) != expected_hash:
-        yield Fault(f"entry {number}", "is not the one with which an earlier check ended: check the whole history")
+        yield AuditFault(f"entry {number}", "is not the one with which an earlier check ended: check the whole history")
 
 
 @dataclass(slots=True)
@@ -488,17 +491,17 @@ def _written_after(agency_id: str, since: int) -> tuple[sa.ColumnElement[bool], 
     return (v.agency_id == agency_id, v.audit_number > since) if since else (v.agency_id == agency_id,)
 
 
-def _compare(entry: EntryRow, count: int, digest: str) -> Iterator[Fault]:
+def _compare(entry: EntryRow, count: int, digest: str) -> Iterator[AuditFault]:
     if count != entry.versions:
         what = f"wrote {entry.versions} versions of markers, {count} are there"
-        yield Fault(f"entry {entry.number}", f"{what}: some were removed, added or moved")
+        yield AuditFault(f"entry {entry.number}", f"{what}: some were removed, added or moved")
     elif digest != entry.digest:
-        yield Fault(f"entry {entry.number}", "the versions of markers that it wrote are not those that are there")
+        yield AuditFault(f"entry {entry.number}", "the versions of markers that it wrote are not those that are there")
 
 
-def _uncovered(group: _Group) -> Fault:
+def _uncovered(group: _Group) -> AuditFault:
     more = f" and {group.count - 1} more" if group.count > 1 else ""
-    return Fault(f"{group.first}{more}", f"names entry {group.number}, which is missing")
+    return AuditFault(f"{group.first}{more}", f"names entry {group.number}, which is missing")
 
 
 # --- versions -----------------------------------------------------------------------------------------------------
@@ -534,17 +537,17 @@ _V = marker_versions.c
 _VERSION = (*(_V[name] for name in _Version._fields[:7]), sa.cast(_V.marker, sa.Text).label("text"), _V.sha256)
 
 
-def _check_versions(connection: sa.Connection, agency_id: str, report: ChainReport) -> Iterator[Fault]:
+def _check_versions(connection: sa.Connection, agency_id: str, report: ChainReport) -> Iterator[AuditFault]:
     """Each version against its hash."""
     for row in connection.execute(sa.select(*_VERSION).where(*_written_after(agency_id, report.since))):
         version = _Version._make(row)
         report.count(versions=1)
         if not version.is_as_written:
             where = f"version {version.version} of marker {version.marker_id}"
-            yield Fault(where, "changed: its hash does not match its content")
+            yield AuditFault(where, "changed: its hash does not match its content")
 
 
-def _check_numbers(connection: sa.Connection, agency_id: str, since: int) -> Iterator[Fault]:
+def _check_numbers(connection: sa.Connection, agency_id: str, since: int) -> Iterator[AuditFault]:
     """Whether each version follows on the one before it."""
     before = marker_versions.alias("before")
     last = (
@@ -561,10 +564,12 @@ def _check_numbers(connection: sa.Connection, agency_id: str, since: int) -> Ite
         .order_by(_V.marker_id, _V.version)
     )
     for marker_id, version, last_before in connection.execute(query):
-        yield Fault(f"{_span('version', 'versions', last_before + 1, version - 1)} of marker {marker_id}", "missing")
+        yield AuditFault(
+            f"{_span('version', 'versions', last_before + 1, version - 1)} of marker {marker_id}", "missing"
+        )
 
 
-def _check_newest(connection: sa.Connection, agency_id: str, since: int) -> Iterator[Fault]:
+def _check_newest(connection: sa.Connection, agency_id: str, since: int) -> Iterator[AuditFault]:
     """Each marker as it is against its newest version."""
     query = (
         sa.select(*_VERSION, *PUBLIC)
@@ -579,7 +584,7 @@ def _check_newest(connection: sa.Connection, agency_id: str, since: int) -> Iter
             continue
         if differing := _differing(now, orjson.loads(version.text)):
             what = f"differs from its version {version.version}: {', '.join(differing)}"
-            yield Fault(f"marker {version.marker_id}", what)
+            yield AuditFault(f"marker {version.marker_id}", what)
 
 
 def _differing(now: dict[str, object], marker: dict[str, object]) -> list[str]:
@@ -591,7 +596,7 @@ def _differing(now: dict[str, object], marker: dict[str, object]) -> list[str]:
     return [] if now == known else [name for name in known if now[name] != known[name]]
 
 
-def _check_lost(connection: sa.Connection, agency_id: str) -> Iterator[Fault]:
+def _check_lost(connection: sa.Connection, agency_id: str) -> Iterator[AuditFault]:
     """Markers whose newest version is not there."""
     v = marker_versions.c
     same = sa.and_(v.marker_id == markers.c.id, v.version == markers.c.version, v.agency_id == markers.c.agency_id)
@@ -602,7 +607,7 @@ def _check_lost(connection: sa.Connection, agency_id: str) -> Iterator[Fault]:
         .order_by(markers.c.id)
     )
     for marker_id, version in connection.execute(query):
-        yield Fault(f"version {version} of marker {marker_id}", "missing, and it is the newest")
+        yield AuditFault(f"version {version} of marker {marker_id}", "missing, and it is the newest")
 
 
 def _span(one: str, many: str, first: int, last: int) -> str:

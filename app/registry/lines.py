@@ -11,13 +11,14 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 import sqlalchemy as sa
 from pyproj import Geod
 
 from app.errors import MalformedRequest
+from app.registry.column_types import fetch_all
 from app.registry.features import Field
 from app.registry.marker_rows import markers
 from app.registry.markers import magnets
@@ -150,7 +151,7 @@ def _find_place(connection: sa.Connection, agency_id: str, marker_id: str) -> Li
 
 def make_line(
     line_id: str,
-    rows: Sequence[Any],
+    rows: Sequence[_CerpmRow | _MagnetRow],
     *,
     family: str,
     code: str | None,
@@ -161,7 +162,7 @@ def make_line(
     points = [(row.lon_deg, row.lat_deg) for row in rows]
     gaps_m = np.array(_GEOD.line_lengths([lon for lon, _ in points], [lat for _, lat in points]))
     statuses = {row.status for row in rows}
-    properties = {
+    properties: dict[str, object] = {
         "family": family,
         "code": code,
         "side": side,
@@ -215,11 +216,11 @@ class CerpmRuns:
         agency_id: str,
         *,
         box: Box | None,
-        pinned: Mapping[str, Any],
+        pinned: Mapping[str, object],
         after: LinePlace | None,
     ) -> Iterator[Line]:
         """Runs in the order of roads and measures."""
-        for run in _runs(connection, agency_id, box, road=pinned.get("road"), after=after):
+        for run in _runs(connection, agency_id, box, road=cast("str | None", pinned.get("road")), after=after):
             yield _line_of_run(run)
 
     def find_line(self, connection: sa.Connection, agency_id: str, place: LinePlace) -> Line | None:
@@ -231,12 +232,24 @@ class CerpmRuns:
         return _line_of_run(run) if run is not None and run[0].id == place.id else None
 
 
+class _CerpmRow(NamedTuple):
+    """A CERPM with a measure on a road."""
+
+    id: str
+    road: str
+    status: str
+    lon_deg: float
+    lat_deg: float
+    measure_m: float
+    side: str
+
+
 @dataclass(slots=True)
 class _Run:
     """A run that is being read; of one that is not wanted only the last row is kept."""
 
     is_wanted: bool
-    rows: list[Any]
+    rows: list[_CerpmRow]
 
 
 def _runs(
@@ -245,9 +258,9 @@ def _runs(
     box: Box | None,
     *,
     road: str | None = None,
-    after: Any = None,
-    first: Any = None,
-) -> Generator[list[Any]]:
+    after: LinePlace | None = None,
+    first: LinePlace | None = None,
+) -> Generator[list[_CerpmRow]]:
     """Runs in the order of the roads, measures and ids of their first CERPMs: all, or from one on, or after one."""
     side = _C.spec["side"].as_string().label("side")
     listed = [
@@ -265,22 +278,23 @@ def _runs(
         roads = connection.execute(sa.select(_C.road).where(*listed, near).distinct()).scalars().all()
         query = query.where(_C.road.in_(roads))
     begin = after or first
-    if begin is not None:  # what belongs to a run that began before has a neighbour at most a gap before
+    if begin is not None and begin.measure_m is not None:
+        # what belongs to a run that began before has a neighbour at most a gap before
         earliest = sa.tuple_(sa.literal(begin.road), sa.literal(begin.measure_m - MAX_GAP_M))
         query = query.where(sa.tuple_(_C.road, _C.measure_m) >= earliest)
     rows = connection.execute(query.order_by(_C.road, _C.measure_m, _C.id), execution_options=_STREAMED)
     with closing(rows):
-        yield from _cut(rows, lambda row: _is_before(row, begin, or_at=after is not None))
+        yield from _cut(map(_CerpmRow._make, rows), lambda row: _is_before(row, begin, or_at=after is not None))
 
 
-def _is_before(row: Any, begin: Any, *, or_at: bool) -> bool:
-    if begin is None or row.road != begin.road:
+def _is_before(row: _CerpmRow, begin: LinePlace | None, *, or_at: bool) -> bool:
+    if begin is None or begin.measure_m is None or row.road != begin.road:
         return False
     at, limit = (row.measure_m, row.id), (begin.measure_m, begin.id)
-    return bool(at <= limit if or_at else at < limit)
+    return at <= limit if or_at else at < limit
 
 
-def _cut(rows: Iterable[Any], is_before: Callable[[object], bool]) -> Iterator[list[object]]:
+def _cut(rows: Iterable[_CerpmRow], is_before: Callable[[_CerpmRow], bool]) -> Iterator[list[_CerpmRow]]:
     """Runs of rows in the order of roads and measures, but those that begin before; each as soon as it is complete."""
     begun: deque[_Run] = deque()
     growing: dict[str, _Run] = {}
@@ -303,17 +317,17 @@ def _cut(rows: Iterable[Any], is_before: Callable[[object], bool]) -> Iterator[l
         yield from _wanted(begun.popleft())
 
 
-def _is_complete(run: _Run, growing: Mapping[str, _Run], row: Any) -> bool:
+def _is_complete(run: _Run, growing: Mapping[str, _Run], row: _CerpmRow) -> bool:
     last = run.rows[-1]
     return growing.get(last.side) is not run or row.measure_m - last.measure_m > MAX_GAP_M
 
 
-def _wanted(run: _Run) -> Iterator[list[object]]:
+def _wanted(run: _Run) -> Iterator[list[_CerpmRow]]:
     if run.is_wanted and len(run.rows) >= 2:
         yield run.rows
 
 
-def _line_of_run(run: list[Any]) -> Line:
+def _line_of_run(run: list[_CerpmRow]) -> Line:
     measures = (run[0].measure_m, run[-1].measure_m)
     return make_line(run[0].id, run, family="cerpm", code=None, side=run[0].side, measures=measures)
 
@@ -347,7 +361,7 @@ class MagnetLines:
 
     def find_line(self, connection: sa.Connection, agency_id: str, place: LinePlace) -> Line | None:
         """The line of a marker."""
-        rows = connection.execute(_magnets_of(agency_id).where(_C.id == place.id)).all()
+        rows = _list_magnets(connection, agency_id, _C.id == place.id)
         return _line_of(rows) if len(rows) >= 2 else None
 
 
@@ -360,22 +374,34 @@ def _lines(connection: sa.Connection, agency_id: str, box: Box | None, after: st
         chunk = connection.execute(ids if after is None else ids.where(_C.id > after)).scalars().all()
         if not chunk:
             return
-        rows = connection.execute(_magnets_of(agency_id).where(_C.id.in_(chunk))).all()
+        rows = _list_magnets(connection, agency_id, _C.id.in_(chunk))
         for _, group in groupby(rows, key=lambda row: row.id):
             if len(line := list(group)) >= 2:
                 yield _line_of(line)
         after = chunk[-1]
 
 
-def _magnets_of(agency_id: str) -> sa.Select[Any]:
-    return (
+class _MagnetRow(NamedTuple):
+    """A magnet of a painted line; id, code, road and status are of the line."""
+
+    id: str
+    digits: str
+    road: str | None
+    status: str
+    lon_deg: float
+    lat_deg: float
+
+
+def _list_magnets(connection: sa.Connection, agency_id: str, of_lines: sa.ColumnElement[bool]) -> list[_MagnetRow]:
+    query = (
         sa.select(_C.id, _C.digits, _C.road, _C.status, magnets.c.lon_deg, magnets.c.lat_deg)
         .join(magnets, magnets.c.marker_id == _C.id)
-        .where(_C.agency_id == agency_id, *_PAINTED)
+        .where(_C.agency_id == agency_id, *_PAINTED, of_lines)
         .order_by(_C.id, magnets.c.number)
     )
+    return fetch_all(connection, query, _MagnetRow)
 
 
-def _line_of(rows: Sequence[Any]) -> Line:
+def _line_of(rows: Sequence[_MagnetRow]) -> Line:
     first = rows[0]
     return make_line(first.id, rows, family="magnet", code=first.digits, side=None, measures=(None, None))

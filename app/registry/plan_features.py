@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.ext.compiler import compiles
@@ -93,9 +92,11 @@ def _one_of(name: str) -> sa.ColumnElement[bool]:
 
 
 _STATUS = sa.case(
-    (plans.c.status != COMMITTED, plans.c.status), (_one_of("built"), BUILT), (_one_of("surveyed"), SURVEYED),
+    (plans.c.status != COMMITTED, plans.c.status),
+    (_one_of("built"), BUILT),
+    (_one_of("surveyed"), SURVEYED),
     else_=COMMITTED,
-)  # fmt: skip
+)
 PLAN_FIELDS = (
     Field("number", "integer", _P.number, "In its plan, from 1"),
     Field("family", "string", _P.family, "plate, magnet or cerpm"),
@@ -200,7 +201,10 @@ class AlignmentLanes:
 
 
 def add_lanes(
-    connection: sa.Connection, agency_id: str, alignment_id: str, lanes: Sequence[tuple[dict[str, object], list[Any]]]
+    connection: sa.Connection,
+    agency_id: str,
+    alignment_id: str,
+    lanes: Sequence[tuple[dict[str, object], list[list[float]]]],
 ) -> None:
     """Store the properties and the points [lon, lat] of the lanes of a new alignment."""
     rows = [
@@ -222,11 +226,13 @@ def _near(box: Box | None) -> list[sa.ColumnElement[bool]]:
     c = alignment_lanes.c
     parts = [
         sa.and_(
-            c.west_deg <= part.east_deg, c.east_deg >= part.west_deg,
-            c.south_deg <= part.north_deg, c.north_deg >= part.south_deg,
+            c.west_deg <= part.east_deg,
+            c.east_deg >= part.west_deg,
+            c.south_deg <= part.north_deg,
+            c.north_deg >= part.south_deg,
         )
         for part in box.parts
-    ]  # fmt: skip
+    ]
     return [sa.or_(*parts)]
 
 

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Annotated, NotRequired, cast
+from typing import Annotated, Literal, NotRequired, cast
 
 import sqlalchemy as sa
 import structlog
 from pydantic import Field
-from typing_extensions import TypedDict
+from typing_extensions import ReadOnly, TypedDict
 
 from app.errors import Conflict, NotAllowed, NotFound, Unavailable
 from app.registry import jobs as registry_jobs
@@ -22,10 +22,13 @@ from app.registry.database import Database
 from app.registry.engines import across_agencies
 from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState, event_of_holder
 from app.services.access.access import AGENCY_SCOPES, Caller, Scope
+from app.services.access.audit import VerificationResult
 from app.services.blobs import delete_unused, staged
 from app.services.documents import ErrorDocument
 from app.services.jobs import RunningJob
+from app.services.plans.documents import MadePlanResult, PackageResult, ProofResult
 from app.services.ports import Blobs, Clock
+from app.services.surveys.import_report import ImportReport
 from app.services.surveys.imports import SETTLED
 
 # === Who sees and cancels jobs of each kind, and where their results are: the rules of the resources that they make.
@@ -48,13 +51,17 @@ class JobRules:
     too_late_progress: float = 2.0  # a job beyond this progress cannot be cancelled any more; over 1: it always can
 
 
+def _itself(job: JobRow) -> str:
+    return f"/v1/jobs/{job.id}"
+
+
 def _about_plan(end: str) -> Callable[[JobRow], str | None]:
     return lambda job: f"/v1/plans/{job.subject_id}{end}" if job.subject_id is not None else None
 
 
 RULES: dict[str, JobRules] = {
     JobKind.DECODE: JobRules(_EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/decodes/{job.id}"),
-    JobKind.IMPORT: JobRules(_SURVEYORS, _SURVEYORS, lambda job: f"/v1/imports/{job.id}", SETTLED),
+    JobKind.IMPORT: JobRules(_SURVEYORS, _SURVEYORS, _itself, SETTLED),
     JobKind.PLAN: JobRules(_READERS, _PLANNERS, _about_plan("")),
     JobKind.PROOF: JobRules(_READERS, _PLANNERS, _about_plan("/proof")),
     JobKind.PACKAGE: JobRules(_READERS, _PLANNERS, _about_plan("/package")),
@@ -64,9 +71,7 @@ RULES: dict[str, JobRules] = {
         frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda job: f"/v1/reprocessings/{job.subject_id}"
     ),
     JobKind.DRIVE: JobRules(_EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/drives/{job.id}"),
-    JobKind.AUDIT: JobRules(
-        frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda job: f"/v1/audit/verifications/{job.id}"
-    ),
+    JobKind.AUDIT: JobRules(frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), _itself),
 }
 _OTHERS = JobRules(frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda _job: None)
 
@@ -97,12 +102,15 @@ class JobLinks(TypedDict):
     result: NotRequired[str]
 
 
-class JobDocument(TypedDict):
-    """A job of any kind. Its result is a resource of its own: `links.result`, once the job is done."""
+class JobHead(TypedDict):
+    """What jobs of every kind have."""
 
     id: str
-    kind: JobKind
+    kind: ReadOnly[JobKind]
     state: JobState
+    subject_id: Annotated[
+        str | None, Field(description="Id of the plan that it is about, or has made, or of the reprocessing.")
+    ]
     attempts: Annotated[int, Field(description="Since the last part of the result was stored.")]
     progress: Annotated[float, Field(description="0 to 1.")]
     done: Annotated[int | None, Field(description="Steps that are done: frames, plates, units; null if not counted.")]
@@ -122,18 +130,87 @@ class JobDocument(TypedDict):
     links: JobLinks
 
 
-class JobPage(TypedDict):
-    """A page of jobs, newest first; the Link header leads to the next one."""
+class JobSummary(JobHead):
+    """A job of any kind, without its result."""
 
-    items: list[JobDocument]
+    kind: JobKind
+
+
+class PlanJob(JobHead):
+    """A job that makes a plan."""
+
+    kind: Literal[JobKind.PLAN]
+    result: MadePlanResult | None
+
+
+class ProofJob(JobHead):
+    """A job that proves a plan."""
+
+    kind: Literal[JobKind.PROOF]
+    result: ProofResult | None
+
+
+class PackageJob(JobHead):
+    """A job that packs the files of a plan."""
+
+    kind: Literal[JobKind.PACKAGE]
+    result: PackageResult | None
+
+
+class ImportJob(JobHead):
+    """A job that imports a survey. A refused import is done, too."""
+
+    kind: Literal[JobKind.IMPORT]
+    result: ImportReport | None
+
+
+class VerificationJob(JobHead):
+    """A job that verifies the agency's audit log."""
+
+    kind: Literal[JobKind.AUDIT]
+    result: VerificationResult | None
+
+
+class OtherJob(JobHead):
+    """A job whose result is a resource of its own: `links.result`, once it is done."""
+
+    kind: Literal[JobKind.DECODE, JobKind.DRIVE, JobKind.ARTWORK, JobKind.EXPORT, JobKind.REPROCESS]
+    result: None
+
+
+JobDocument = PlanJob | ProofJob | PackageJob | ImportJob | VerificationJob | OtherJob
+AnyJob = Annotated[JobDocument, Field(discriminator="kind")]
+RESULTS: dict[JobKind, type] = {
+    JobKind.PLAN: MadePlanResult,
+    JobKind.PROOF: ProofResult,
+    JobKind.PACKAGE: PackageResult,
+    JobKind.IMPORT: ImportReport,
+    JobKind.AUDIT: VerificationResult,
+}
+"""Results that are part of their jobs; a job may keep more beside them, such as keys of blobs."""
+
+
+class JobPage(TypedDict):
+    """A page of jobs without their results, newest first; the Link header leads to the next one."""
+
+    items: list[JobSummary]
 
 
 def job_document(job: JobRow, now: datetime) -> JobDocument:
     """A job as clients see it."""
+    result, shape = job.result, RESULTS.get(JobKind(job.kind))
+    if result is not None:
+        result = None if shape is None else {name: result[name] for name in shape.__annotations__ if name in result}
+    return cast("JobDocument", {**job_summary(job, now), "result": result})
+
+
+def job_summary(job: JobRow, now: datetime) -> JobSummary:
+    """A job without its result."""
     return {
         "id": job.id,
         "kind": JobKind(job.kind),
         "state": job.state,
+        "subject_id": job.subject_id,
         "attempts": job.attempts,
         "progress": job.progress,
         "done": job.steps_done,
@@ -229,7 +306,7 @@ class AllJobs:
         self._database, self.clock = database, clock
 
     def get(self, caller: Caller, job_id: str) -> JobDocument:
-        """A job with its progress.
+        """A job with its progress, and its result once there is one.
 
         Raises
         ------
@@ -245,17 +322,18 @@ class AllJobs:
 
     def page(
         self, caller: Caller, *, kind: JobKind | None = None, state: str | None = None, dead_letter: bool | None = None,
-        before: str | None = None, limit: int = 100,
+        subject_id: str | None = None, before: str | None = None, limit: int = 100,
     ) -> tuple[JobPage, str | None]:  # fmt: skip
         """A page of jobs, newest first, and the id to continue before."""
         kinds = [one for one in visible_kinds(caller) if kind is None or one == kind]
         with self._database.read() as connection:
             rows = registry_jobs.list_jobs(
                 connection, caller.agency_id, kinds,
-                state=state, before=before, limit=limit + 1, holder_id=caller.own_key_id, dead_letter=dead_letter,
+                state=state, before=before, limit=limit + 1, subject_id=subject_id, holder_id=caller.own_key_id,
+                dead_letter=dead_letter,
             )  # fmt: skip
         now = self.clock()
-        page = JobPage(items=[job_document(row, now) for row in rows[:limit]])
+        page = JobPage(items=[job_summary(row, now) for row in rows[:limit]])
         return page, rows[limit - 1].id if len(rows) > limit else None
 
     def cancel(self, caller: Caller, job_id: str) -> JobDocument:
@@ -376,9 +454,11 @@ class JobFiles:
             raise NotFound(f"a {job.kind} makes no file", field="job_id", cure="follow links.result of the job")
         if job.state != "done" or job.result is None:
             raise Conflict(
-                f"the job is {job.state}", field="job_id", limit="jobs that are done",
+                f"the job is {job.state}",
+                field="job_id",
+                limit="jobs that are done",
                 cure=f"GET /v1/jobs/{job_id}/events reports when it is",
-            )  # fmt: skip
+            )
         if job.result.get("blob_key") is None:
             raise NotFound(
                 "the file of this job has expired", field="job_id", limit=f"{KEPT.days} days", cure="ask for it again"

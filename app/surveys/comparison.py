@@ -222,7 +222,7 @@ def find_duplicates(
 
 def _rmse_m(survey: GeoreferencedSurvey, declaration: ImportDeclaration) -> Floats:
     """Horizontal RMSE of each row; NaN where it is not declared. [m]"""
-    whole = declaration.survey.get("horizontal_rmse_m")
+    whole = declaration.survey.horizontal_rmse_m
     of_all = np.full(survey.table.rows, np.nan if whole is None else float(whole))
     own = survey.table.numbers.get("horizontal_rmse_m")
     return of_all if own is None else np.where(np.isfinite(own), own, of_all)

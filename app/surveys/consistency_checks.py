@@ -58,10 +58,13 @@ def check_accuracy(horizontal_rmse_m: float | None, vertical_rmse_m: float | Non
     for field, rmse_m in (("horizontal_rmse_m", horizontal_rmse_m), ("vertical_rmse_m", vertical_rmse_m)):
         if rmse_m is not None and rmse_m > _COARSE_M:
             yield warn(
-                None, field, "coarse_accuracy", f"the stated accuracy is {rmse_m:g} m",
+                None,
+                field,
+                "coarse_accuracy",
+                f"the stated accuracy is {rmse_m:g} m",
                 f"state it in metres ({rmse_m:g} mm are {rmse_m / 1000:g} m), or survey again: for vehicles",
                 (Change(f"survey.{field}", rmse_m / 1000),),
-            )  # fmt: skip
+            )
 
 
 def _check_zeros(survey: GeoreferencedSurvey) -> Iterator[Fault]:
@@ -285,9 +288,12 @@ def _check_steps(survey: GeoreferencedSurvey, rows: npt.NDArray[np.intp]) -> Ite
 
 def _height_fault(row: int, rise_m: float) -> Fault:
     return warn(
-        row + 1, "height", "height_step", f"the height differs by {rise_m:.1f} m from those of the rows beside it",
+        row + 1,
+        "height",
+        "height_step",
+        f"the height differs by {rise_m:.1f} m from those of the rows beside it",
         "check the unit and the vertical datum (geoid or ellipsoid) of these rows",
-    )  # fmt: skip
+    )
 
 
 def nearest_others(points: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:

@@ -145,9 +145,11 @@ def _rows_of(table: SurveyTable, grid: LocalGrid) -> dict[str, int | None]:
         count = len(found[control.point])
         if count > 1 and control.local_easting is None:
             raise InvalidParameter(
-                f"{count} rows have the number of the control point {control.point[:40]!r}", field=_FIELD,
-                limit="one row", cure="declare local_easting and local_northing of the control point",
-            )  # fmt: skip
+                f"{count} rows have the number of the control point {control.point[:40]!r}",
+                field=_FIELD,
+                limit="one row",
+                cure="declare local_easting and local_northing of the control point",
+            )
     return {name: rows[0] if rows else None for name, rows in found.items()}
 
 

@@ -113,11 +113,13 @@ def _check_whole(
         return [_elsewhere(hit, _NEAR_OTHERWISE)]
     return [
         warn(
-            None, "position", "place_unchecked",
+            None,
+            "position",
+            "place_unchecked",
             "no area is declared and no marker is registered near: the location cannot be checked",
             "declare area_deg, the box that the survey lies in",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _no_position(survey: GeoreferencedSurvey, declaration: ImportDeclaration, is_known: HasMarkersNear) -> Fault:
@@ -182,12 +184,14 @@ def _area_only(declaration: ImportDeclaration, *, known: bool) -> list[Fault]:
     inside = "inside the declared area" if declaration.area_deg is not None else "within kilometres of others"
     return [
         warn(
-            None, "position", "place_by_area_only",
+            None,
+            "position",
+            "place_by_area_only",
             f"no marker is registered within {NEAR_M:g} m: it was only checked that the survey lies {inside}; "
             "a shift of all rows, or heights above another datum, would not be noticed",
             "check one row against the map; declare height_range_m where heights matter",
         )
-    ]  # fmt: skip
+    ]
 
 
 def measured_changes(survey: GeoreferencedSurvey) -> tuple[Change, ...]:
@@ -223,11 +227,13 @@ def _check_beside(points: Floats, nearest: Floats, distance_m: Floats) -> list[F
         return []
     return [
         warn(
-            None, "position", "beside_the_registered_line",
+            None,
+            "position",
+            "beside_the_registered_line",
             f"the survey runs about {median:.0f} m beside the registered markers",
             "check the datum of the CRS, its zone, and whether distances are grid or ground",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _check_heights(

@@ -200,11 +200,11 @@ def _filters(language: str) -> Callable[[bytes], object]:
 
 
 def _survey(data: bytes) -> object:
-    return read_survey(data, ImportDeclaration(crs="EPSG:25832", vertical_datum="ellipsoidal"))
+    return read_survey(data, ImportDeclaration(crs="EPSG:25832", vertical_datum="ellipsoid"))
 
 
 def _pnezd(data: bytes) -> object:
-    return read_survey(data, ImportDeclaration(layout="pnezd", crs="EPSG:25832", vertical_datum="ellipsoidal"))
+    return read_survey(data, ImportDeclaration(layout="pnezd", crs="EPSG:25832", vertical_datum="ellipsoid"))
 
 
 def list_parsers() -> list[Parser]:

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from pyproj import CRS
 
 from app.errors import WaymarkError
@@ -22,7 +23,7 @@ from app.formats.surveys.read import read_survey
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope
 from app.services.decoder_tasks import SameProcess
-from app.services.surveys.import_report import ImportInput, ImportReport
+from app.services.surveys.import_report import DeclarationIn, ImportInput, ImportReport, import_input
 from app.services.surveys.imports import Imports
 from app.surveys.georeference import east_north_m, georeference_survey
 from benchmarks.imports.faults import Planted
@@ -60,10 +61,11 @@ class Judge:
             geodetic = CRS(survey.crs).geodetic_crs
             assert geodetic is not None
             crs = ":".join(geodetic.to_2d().to_authority() or ())
-            declaration = ImportDeclaration(
-                crs=crs, family="cerpm", vertical_datum="ellipsoid", columns={"code": "number"}, status="active"
-            )
-            given = ImportInput(SpooledFile.of("\n".join(lines).encode()), declaration, mode="good")
+            declaration = DeclarationIn(
+                crs=crs, family="cerpm", vertical_datum="ellipsoid", columns={"code": "number"}, status="active",
+                mode="good",
+            )  # fmt: skip
+            given = import_input(declaration, SpooledFile.of("\n".join(lines).encode()))
             report, _ = self._imports.run(caller, given)
             assert report["stored"] == len(survey.registered), report["faults"][:3]
         return caller
@@ -71,8 +73,10 @@ class Judge:
     def codes(self, caller: Caller, data: bytes, declaration: dict[str, Any]) -> tuple[bool, Counter[str]]:
         """Whether something is refused, and the faults by code."""
         try:
-            given = ImportInput(SpooledFile.of(data), ImportDeclaration(**declaration), dry_run=True)
+            given = import_input(DeclarationIn(**declaration, dry_run=True), SpooledFile.of(data))
             report, _ = self._imports.run(caller, given)
+        except ValidationError as error:
+            return True, Counter(str(part) for part in error.errors()[0]["loc"][:1])
         except WaymarkError as error:
             return True, Counter([error.field or "file"])
         refused = any(fault["severity"] == "refused" for fault in report["faults"])
@@ -102,7 +106,7 @@ def moved_m(planted: Planted) -> float:
     try:
         declaration = ImportDeclaration(**planted.declaration)
         placed = georeference_survey(read_survey(planted.data, declaration), declaration, 0.1)
-    except WaymarkError:
+    except (WaymarkError, ValidationError):
         return float("nan")
     survey = planted.survey
     place_of = {code: k for k, code in enumerate(survey.codes)}

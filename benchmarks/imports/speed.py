@@ -147,13 +147,12 @@ def main() -> None:
     """One step in this process; its figures as JSON."""
     from app.families.surveys import MarkerRules
     from app.formats.format import SpooledFile
-    from app.formats.surveys.declaration import ImportDeclaration
     from app.registry.database import Database
     from app.registry.markers import MarkerFilter
     from app.services.access.access import Access, Scope
     from app.services.decoder_tasks import SameProcess
     from app.services.surveys.exports import Exports
-    from app.services.surveys.import_report import ImportInput
+    from app.services.surveys.import_report import DeclarationIn, import_input
     from app.services.surveys.imports import Imports
     from benchmarks.imports.judge import now
 
@@ -165,10 +164,10 @@ def main() -> None:
     caller = access.authenticate(access.create_key("bench", Scope.PLANNER, "bench"))
     began, cpu_began = time.perf_counter(), time.process_time()
     if step == "import":
-        declaration = ImportDeclaration(
+        declaration = DeclarationIn(
             crs="EPSG:4326", vertical_datum="ellipsoid", family="cerpm", columns={"code": "number"}
         )
-        given = ImportInput(SpooledFile.at(Path(survey)), declaration)
+        given = import_input(declaration, SpooledFile.at(Path(survey)))
         report, _ = Imports(database, now, SameProcess(), MarkerRules()).run(caller, given)
         if report["stored"] != report["rows"]:
             raise SystemExit(f"{report['stored']} of {report['rows']} rows were stored")

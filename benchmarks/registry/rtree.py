@@ -138,12 +138,11 @@ def _import(way: str, rows: int) -> None:
     """One import in this process, with the R*Tree filled in one of the ways."""
     from app.families.surveys import MarkerRules
     from app.formats.format import SpooledFile
-    from app.formats.surveys.declaration import ImportDeclaration
     from app.registry.database import Database
     from app.registry.engines import across_agencies
     from app.services.access.access import Access, Scope
     from app.services.decoder_tasks import SameProcess
-    from app.services.surveys.import_report import ImportInput
+    from app.services.surveys.import_report import DeclarationIn, import_input
     from app.services.surveys.imports import Imports
     from benchmarks.imports.judge import now
     from benchmarks.imports.speed import write_survey
@@ -163,10 +162,10 @@ def _import(way: str, rows: int) -> None:
         database.migrate()
         access = Access(database, now)
         caller = access.authenticate(access.create_key("bench", Scope.PLANNER, "bench"))
-        declaration = ImportDeclaration(
+        declaration = DeclarationIn(
             crs="EPSG:4326", vertical_datum="ellipsoid", family="cerpm", columns={"code": "number"}
         )
-        given = ImportInput(SpooledFile.at(survey), declaration)
+        given = import_input(declaration, SpooledFile.at(survey))
         with mock.patch.object(bulk_load, "fill_rtree", fill):
             began, cpu_began = time.perf_counter(), time.process_time()
             Imports(database, now, SameProcess(), MarkerRules()).run(caller, given)

@@ -116,13 +116,13 @@ def test_a_plan_is_made(client: httpx.Client) -> None:
     assert answer.status_code == 202, answer.text
     job = finished(client, answer.headers["Location"])
     assert (job["kind"], job["state"]) == ("plan", "done"), job
-    assert client.get(job["links"]["plan"]).json()["name"] == "p"
+    assert client.get(job["links"]["result"]).json()["name"] == "p"
 
 
 def test_a_survey_is_imported_once(client: httpx.Client) -> None:
     job = _send(client, _csv(3), DEGREES, Prefer="respond-async")
     assert job.status_code == 202, job.text
-    assert finished(client, f"/v1/imports/{job.json()['id']}")["state"] == "done"
+    assert finished(client, f"/v1/jobs/{job.json()['id']}")["state"] == "done"
     assert len(_markers(client)) == 3
 
 
@@ -155,7 +155,7 @@ def test_a_plan_is_proved(client: httpx.Client) -> None:
     answer = client.post(f"/v1/plans/{plan['id']}/proof", json=terms, headers={"If-Match": '"1"'})
     assert answer.status_code == 202, answer.text
     job = finished(client, answer.headers["Location"])
-    assert (job["kind"], job["state"], job["steps_done"]) == ("proof", "done", job["steps_total"]), job
+    assert (job["kind"], job["state"], job["done"]) == ("proof", "done", job["total"]), job
     assert client.get(f"/v1/plans/{plan['id']}/proof").json()["complete"]
 
 

@@ -13,7 +13,7 @@ from app.formats.alignments.geometry import EventKind
 from app.markers.reading import Verdict
 from app.planning.alignment import Alignment, RoadEvent
 from app.planning.outputs.bill import plan_bill
-from app.planning.outputs.package import OutputOptions, plan_files
+from app.planning.outputs.package import plan_files
 from app.planning.outputs.plan_document import read_plan, write_plan
 from app.planning.placement import place_plan
 from app.planning.plan import Plan
@@ -137,7 +137,7 @@ def test_an_optimised_plan_is_written_with_its_trade_off_and_read_back() -> None
     plan = made(road(straight(800, speed_kmh=60.0)), plates={})
     again = read_plan(write_plan(plan))
     assert again.optimum == plan.optimum
-    files = {file.name: file for file in plan_files(again, OutputOptions(draw_trade_off=draw_trade_off))}
+    files = {file.name: file for file in plan_files(again, draw_trade_off=draw_trade_off)}
     lines = files["trade-off.csv"].write().decode().splitlines()
     assert lines[0].startswith("fix_every_m,path_error_m,cost,bound,even_cost")
     assert lines[1].startswith("120,,")

@@ -10,7 +10,7 @@ import pytest
 from app.errors import InvalidParameter
 from app.markers.reading import RadioFinding, Verdict
 from app.planning import radio_checks
-from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_radio, recommend_settings
+from app.planning.radio_checks import EvenRoad, PreviewRule, RadioCheck, RadioPlan, check_radio, recommend_settings
 from app.radio.link import LinkModel
 from app.radio.reception import Air, Approach, Receiver, RoadMarkers, approach
 from app.radio.regulation import is_permitted
@@ -51,29 +51,30 @@ def test_the_papers_radio_on_a_long_road_is_neither_lawful_nor_heard() -> None:
 def test_ten_markers_a_side_are_read_at_the_cameras_preview() -> None:
     check = check_radio(RadioPlan(RadioSettings(), markers=TEN_A_SIDE, preview=PreviewRule(31.0)))
     assert check.read_probability >= 0.99
-    assert check.road.in_range.max() == 20
-    assert np.all((check.road.success_min > 0) & (check.road.success_mean <= 1))
+    assert max(check.road.markers_in_range) == 20
+    assert all(success is not None and success > 0 for success in check.road.packet_success_min)
+    assert all(success is not None and success <= 1 for success in check.road.packet_success_mean)
     assert check.verdict is Verdict.WARN
     assert [finding.name for finding in check.checks if not finding.passed] == ["battery-life"]
 
 
 def test_an_even_road_is_checked_at_its_middle() -> None:
     plan = RadioPlan(RadioSettings(), preview=PreviewRule(31.0))
-    long_road = RoadMarkers.evenly(plan.spacing_m, 1200.0)
+    long_road = plan.road.markers(1200.0)
     middle = RoadMarkers(np.append(long_road.chainage_m, 0.0)[1:], np.append(long_road.offset_m, 1.8)[1:])
     given = check_radio(replace(plan, markers=middle))
     even = check_radio(plan)
     assert given.read_probability == pytest.approx(even.read_probability, abs=0.03)
-    assert given.road.in_range.max() == even.road.in_range.max()
+    assert max(given.road.markers_in_range) == max(even.road.markers_in_range)
 
 
 def test_reading_in_time_is_harder_the_faster_the_denser_and_the_farther() -> None:
     plan = RadioPlan(RadioSettings(), preview=PreviewRule(31.0))
     base = check_radio(plan).read_probability
     assert check_radio(replace(plan, design_speed_m_s=25.0)).read_probability < base
-    assert check_radio(replace(plan, spacing_m=6.0)).read_probability < base
+    assert check_radio(replace(plan, road=EvenRoad(6.0))).read_probability < base
     assert check_radio(replace(plan, preview=PreviewRule(60.0))).read_probability < base
-    assert check_radio(replace(plan, sides=1)).read_probability > base
+    assert check_radio(replace(plan, road=EvenRoad(sides=1))).read_probability > base
     assert check_radio(replace(plan, link=LinkModel(near_dbm=-118.0))).read_probability < base
 
 
@@ -108,7 +109,7 @@ def test_a_receiver_among_two_thousand_reads_nothing() -> None:
     markers = RoadMarkers(np.linspace(0.0, 240.0, 2000), np.tile([1.8, -1.8], 1000))
     check = check_radio(RadioPlan(RadioSettings(), markers=markers, preview=PreviewRule(31.0)))
     assert check.read_probability < 1e-6
-    assert check.road.in_range.max() > 1900
+    assert max(check.road.markers_in_range) > 1900
 
 
 @pytest.mark.parametrize(
@@ -116,9 +117,6 @@ def test_a_receiver_among_two_thousand_reads_nothing() -> None:
     [
         ({"design_speed_m_s": 0.0}, "design_speed_m_s"),
         ({"design_speed_m_s": float("nan")}, "design_speed_m_s"),
-        ({"spacing_m": 0.5}, "spacing_m"),
-        ({"sides": 0}, "sides"),
-        ({"lane_width_m": 50.0}, "lane_width_m"),
         ({"min_probability": 1.0}, "min_probability"),
         ({"min_battery_days": -1.0}, "min_battery_days"),
     ],
@@ -132,6 +130,9 @@ def test_plans_outside_their_limits_are_refused(values: dict[str, float], field:
 @pytest.mark.parametrize(
     ("make", "field"),
     [
+        (lambda: EvenRoad(0.5), "road.spacing_m"),
+        (lambda: EvenRoad(sides=0), "road.sides"),
+        (lambda: EvenRoad(lane_width_m=50.0), "road.lane_width_m"),
         (lambda: PreviewRule(0.0), "preview.distance_m"),
         (lambda: PreviewRule(deceleration_m_s2=0.0), "preview.deceleration_m_s2"),
         (lambda: Battery(capacity_mah=0.0), "battery.capacity_mah"),
@@ -169,7 +170,7 @@ def test_power_costs_what_the_data_sheet_says(power_dbm: float, current_ma: floa
     "plan",
     [
         RadioPlan(PAPERS_RADIO, markers=TEN_A_SIDE, preview=PreviewRule(31.0)),
-        RadioPlan(RadioSettings(), spacing_m=24.384, preview=PreviewRule(31.0)),
+        RadioPlan(RadioSettings(), road=EvenRoad(24.384), preview=PreviewRule(31.0)),
         RadioPlan(RadioSettings()),
     ],
     ids=["ten a side", "80 ft", "40 ft at the stopping distance"],
@@ -177,10 +178,10 @@ def test_power_costs_what_the_data_sheet_says(power_dbm: float, current_ma: floa
 def test_recommended_settings_pass_the_checks(plan: RadioPlan) -> None:
     found = recommend_settings(plan)
     assert found.reaches
-    assert found.settings is not None
-    assert is_permitted(found.settings, plan.region)
+    assert found.radio is not None
+    assert is_permitted(found.radio, plan.region)
     receiver = replace(plan.receiver, channels=found.receiver_channels)
-    check = check_radio(replace(plan, settings=found.settings, receiver=receiver))
+    check = check_radio(replace(plan, radio=found.radio, receiver=receiver))
     assert named(check, "read-in-time").passed
     assert check.battery_days == found.battery_days
     if plan.markers is None:
@@ -200,28 +201,28 @@ def test_a_quieter_air_needs_no_more_channels() -> None:
 def test_of_those_that_reach_the_longest_lived_is_recommended() -> None:
     plan = RadioPlan(RadioSettings(), markers=TEN_A_SIDE, preview=PreviewRule(31.0))
     found = recommend_settings(plan)
-    assert found.settings is not None
-    assert found.battery_days > battery_life_days(replace(found.settings, interval_s=1.0), plan.battery)
-    rarer = replace(found.settings, interval_s=1.3 * found.settings.interval_s)
-    assert check_radio(replace(plan, settings=rarer)).read_probability < plan.min_probability
+    assert found.radio is not None
+    assert found.battery_days > battery_life_days(replace(found.radio, interval_s=1.0), plan.battery)
+    rarer = replace(found.radio, interval_s=1.3 * found.radio.interval_s)
+    assert check_radio(replace(plan, radio=rarer)).read_probability < plan.min_probability
 
 
 def test_more_markers_than_a_check_takes_are_refused_and_not_recommended() -> None:
-    crowded = RadioPlan(replace(PAPERS_RADIO, spreading_factor=12, interval_s=20.0), spacing_m=1.0)
+    crowded = RadioPlan(replace(PAPERS_RADIO, spreading_factor=12, interval_s=20.0), road=EvenRoad(1.0))
     with pytest.raises(InvalidParameter, match="in reach") as caught:
         check_radio(crowded)
-    assert caught.value.field == "spacing_m"
+    assert caught.value.field == "road.spacing_m"
     assert not recommend_settings(crowded, more_channels=False).reaches
 
 
 def test_what_cannot_be_reached_lawfully_is_said() -> None:
     found = recommend_settings(RadioPlan(EUROPE, region=Region.EU868))
     assert not found.reaches
-    assert found.settings is not None
-    assert is_permitted(found.settings, Region.EU868)
+    assert found.radio is not None
+    assert is_permitted(found.radio, Region.EU868)
     assert found.read_probability < 0.99
     nowhere = recommend_settings(RadioPlan(RadioSettings(), region=Region.EU868))
-    assert nowhere.settings is None
+    assert nowhere.radio is None
     assert "no settings are lawful" in nowhere.sentence
 
 

@@ -224,9 +224,13 @@ def test_stations_say_how_many_are_in_range() -> None:
     air = Air(RadioSettings(), STEADY, DEAF_TO_CAPTURE)
     markers = RoadMarkers(np.arange(0, 1000, 10.0), np.zeros(100))
     road = road_reception(markers, [500.0, -air.range_m + 5.0, 5000.0], air)
-    assert road.in_range.tolist() == [2 * math.floor(air.range_m / 10) + 1, 1, 0]
-    assert road.success_min[0] <= road.success_mean[0] < road.success_mean[1] == 1.0
-    assert math.isnan(road.success_mean[2])
+    assert road.markers_in_range == [2 * math.floor(air.range_m / 10) + 1, 1, 0]
+    first, second, none = road.packet_success_mean
+    lowest = road.packet_success_min[0]
+    assert first is not None
+    assert lowest is not None
+    assert lowest <= first < 1.0 == second
+    assert none is None
 
 
 @pytest.mark.parametrize(

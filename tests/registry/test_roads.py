@@ -16,13 +16,14 @@ from app.registry.database import Database
 from app.registry.marker_rows import marker_versions, markers
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
-from app.services.roads.documents import CalibrationInput, LinesInput
-from app.services.roads.roads import NewRoad, RoadChange, Roads
+from app.services.roads.documents import GeoLineIn, RoadIn, RoadPatch, StationIn
+from app.services.roads.roads import Roads
 
 GEOD = Geod(ellps="WGS84")
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
 COUNT = 1_500
 LINE = ((8.4, 49.0), GEOD.fwd(8.4, 49.0, 60, 10_000)[:2])
+ROAD = RoadIn(name="A 5", geometry=GeoLineIn(type="LineString", coordinates=[list(point) for point in LINE]))
 
 
 @pytest.fixture
@@ -60,14 +61,14 @@ def _measures(database: Database) -> list[tuple[float, float, int]]:
 def test_thousands_of_markers_are_measured_and_the_log_covers_each(database: Database, caller: Caller) -> None:
     along = _fill(database, caller)
     roads = Roads(database, lambda: NOW)
-    road, _ = roads.register(caller, NewRoad("A 5", LinesInput((LINE,))))
+    road, _ = roads.register(caller, ROAD)
     assert (road["markers"]["measured"], road["markers"]["left"]) == (COUNT, 1)
     found = _measures(database)
     assert np.allclose([measure for measure, _, _ in found], along, atol=1e-6)
     assert np.abs([offset for _, offset, _ in found]).max() < 1e-6
     assert {version for _, _, version in found} == {2}
-    calibration = (CalibrationInput(1_000.0, vertex=0), CalibrationInput(10_900.0, vertex=1))
-    changed = roads.change(caller, road["id"], RoadChange(calibration=calibration), 1)
+    calibration = [StationIn(measure_m=1_000.0, vertex=0), StationIn(measure_m=10_900.0, vertex=1)]
+    changed = roads.change(caller, road["id"], RoadPatch(calibration=calibration), 1)
     assert changed["markers"]["measured"] == COUNT
     assert np.allclose([measure for measure, _, _ in _measures(database)], 1_000 + along * 0.99, atol=1e-6)
     with database.read() as connection:
@@ -85,7 +86,7 @@ def test_thousands_of_markers_are_measured_and_the_log_covers_each(database: Dat
 @pytest.mark.slow
 def test_down_and_up_again_keeps_markers_and_their_measures(database: Database, caller: Caller) -> None:
     _fill(database, caller)
-    Roads(database, lambda: NOW).register(caller, NewRoad("A 5", LinesInput((LINE,))))
+    Roads(database, lambda: NOW).register(caller, ROAD)
     before = _measures(database)
     database.migrate("0006")
     with database.read() as connection:
@@ -95,5 +96,5 @@ def test_down_and_up_again_keeps_markers_and_their_measures(database: Database, 
     database.migrate()
     assert database.is_ready()
     assert _measures(database) == before
-    road, _ = Roads(database, lambda: NOW).register(caller, NewRoad("A 5", LinesInput((LINE,))))
+    road, _ = Roads(database, lambda: NOW).register(caller, ROAD)
     assert (road["version"], road["markers"]["unchanged"]) == (1, COUNT)

@@ -9,7 +9,6 @@ import pytest
 import sqlalchemy as sa
 from pyproj import Transformer
 
-from app.api.surveys.schemas import DeclarationIn
 from app.errors import InvalidParameter
 from app.families.surveys import MarkerRules
 from app.formats.format import SpooledFile
@@ -19,7 +18,7 @@ from app.registry.marker_rows import markers
 from app.services.access.access import Access, Scope
 from app.services.decoder_tasks import SameProcess
 from app.services.ports import utc_now
-from app.services.surveys.import_report import ImportReport, import_input
+from app.services.surveys.import_report import DeclarationIn, ImportReport, import_input
 from app.services.surveys.imports import SETTLED, Imports
 
 DECLARED = {"crs": "EPSG:25832", "family": "cerpm", "area_deg": [8.3, 48.9, 8.6, 49.1], "ignore_heights": True}
@@ -46,7 +45,7 @@ def send(database: Database, request: pytest.FixtureRequest) -> Send:
 
     def run(data: bytes, step: Callable[[float], None] = lambda _progress: None, **declared: Any) -> ImportReport:
         declaration = DeclarationIn.model_validate({**DECLARED, **declared})
-        return imports.run(caller, import_input(declaration.declared(), SpooledFile.of(data)), step=step)[0]
+        return imports.run(caller, import_input(declaration, SpooledFile.of(data)), step=step)[0]
 
     return run
 

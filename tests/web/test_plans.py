@@ -334,8 +334,8 @@ def test_a_running_proof_is_followed_after_a_reload_and_cancelled(
     page.locator(".job").get_by_role("button", name="Cancel").click()
     page.get_by_text("Cancelled").wait_for()
     with server.client() as client:
-        [job] = client.get("/v1/plan-jobs", params={"plan_id": plans[0]}).json()["items"]
-        assert finished(client, f"/v1/plan-jobs/{job['id']}")["state"] == "cancelled"
+        [job] = client.get("/v1/jobs", params={"subject_id": plans[0]}).json()["items"]
+        assert finished(client, f"/v1/jobs/{job['id']}")["state"] == "cancelled"
 
 
 def test_a_plan_prints_as_a_report(watched: Watched, plans: tuple[str, str]) -> None:

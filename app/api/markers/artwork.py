@@ -33,7 +33,7 @@ from app.families.documents import Flag, StrictModel
 from app.markers.cerpm import MAX_SEQUENCE
 from app.services.markers.artwork import ArtworkJobs, Artworks, Bundle, bundle_options
 from app.services.markers.programs import CerpmPrograms, Layouts, PayloadDocument, payload_document
-from app.services.progress import JobDocument
+from app.services.progress import OtherJob
 
 router = Router("/v1", "artwork")
 
@@ -122,7 +122,7 @@ def get_artwork(
     response_class=StreamingResponse,
     responses={
         **file_response(["application/zip"], headers=_HEADERS),
-        202: {"model": JobDocument, "description": "Queued; Location leads to its progress"},
+        202: {"model": OtherJob, "description": "Queued; Location leads to its progress"},
         **problem_responses(404),
     },
 )

@@ -13,7 +13,7 @@ from app.api.http.dependencies import AfterLink, Caller, Identifier, LastId, Num
 from app.api.http.permissions import READERS
 from app.api.http.responses import checked_id, cursor_of, document_response, json_response, page_response, parse_time
 from app.api.http.routes import Router
-from app.api.http.strict_json import AnyPolygon, GeoLineIn
+from app.api.http.strict_json import AnyPolygon
 from app.errors import InvalidParameter
 from app.families import FamilyName
 from app.families.documents import Metres, StrictModel
@@ -31,6 +31,7 @@ from app.services.markers.searches import (
     parse_box,
     parse_numbers,
 )
+from app.services.roads.documents import GeoLineIn
 
 # === Which markers are meant: the query parameters that the list of markers and its exports share.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request, Response
+from pydantic import ConfigDict, Field
 
 from app.api.http.bodies import (
     FORM,
@@ -19,7 +20,7 @@ from app.api.http.bodies import (
     read_text,
     received_form,
 )
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_case
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
 from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses, reference
 from app.api.http.responses import (
@@ -36,13 +37,47 @@ from app.api.http.responses import (
 )
 from app.api.http.routes import Router
 from app.api.markers.searches import Filtered
-from app.api.plans.schemas import AlignmentIn, RoadAlignmentIn
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.formats.alignments.read import RoadLanes
 from app.formats.format import SpooledFile
+from app.inputs import StrictModel
+from app.planning.alignment import AlignmentDeclaration
 from app.services.idempotency import IdempotencyKey
 from app.services.plans.alignments import Alignments
 from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
 from app.services.plans.tasks import MAX_SAMPLES, MapForm
+
+Name = Annotated[Text, Field(min_length=1, max_length=80)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignmentIn(AlignmentDeclaration):
+    """What is declared of a file with a road, and the name of the alignment."""
+
+    name: Name
+
+
+class RoadAlignmentIn(StrictModel):
+    """Lanes along a registered road; they stay as they are when the road is changed."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "L 560, two lanes",
+                    "road_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "lanes": {
+                        "forward": 1, "backward": 1, "width_m": 3.5, "speed_limit_kmh": 70, "centre_style": "dashed",
+                    },
+                }
+            ]
+        },
+    )  # fmt: skip
+
+    name: Name
+    road_id: Identifier
+    lanes: RoadLanes
+
 
 router = Router("/v1/alignments", "plans")
 
@@ -126,7 +161,7 @@ def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Call
         )
         return created_response(document, replayed, path="/v1/alignments")
     document, replayed = alignments.add(
-        caller, declared.name, upload.file, upload.file_name, declared.declaration(), upload.idempotency
+        caller, declared.name, upload.file, upload.file_name, declared, upload.idempotency
     )
     return created_response(document, replayed, path="/v1/alignments")
 

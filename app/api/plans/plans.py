@@ -1,13 +1,15 @@
-"""/v1/plans: markers placed on a road by rules, checked, approved and committed; their rules, packages and proofs."""
+"""/v1/plans: markers placed on a road by rules, checked, proved, approved, committed and packed; radio checks."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, cast
 
 import orjson
 from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from pydantic import ConfigDict, Field, JsonValue, with_config
 
 from app.api.http.dependencies import (
     AfterVersion,
@@ -35,10 +37,14 @@ from app.api.http.responses import (
     wants_job,
 )
 from app.api.http.routes import Router
-from app.api.plans.schemas import PackageIn, PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
-from app.planning.outputs.package import MEDIA_TYPES
+from app.api.jobs import queued_job
+from app.api.plans.alignments import Name
+from app.formats.surveys.declaration import Unit
+from app.inputs import Flag, StrictModel
+from app.planning.outputs.package import MEDIA_TYPES, PackageOptions
+from app.planning.proof import ProofReport, ProofTerms
+from app.planning.radio_checks import RadioCheck, RadioPlan, check_radio
 from app.planning.rules import read_rules, rules_schema
-from app.registry.jobs import JobState
 from app.services.plans.documents import (
     AsBuiltDocument,
     CommittedPlan,
@@ -47,13 +53,88 @@ from app.services.plans.documents import (
     PlanPreview,
     PlanStatus,
     PlanVersionPage,
-    ProofDocument,
     ReadRules,
 )
 from app.services.plans.making import MAX_MARKERS, PlanMaking, PlanPreviews
 from app.services.plans.packages import Packages
 from app.services.plans.plans import Plans
-from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, PlanJobDocument, PlanJobPage, PlanJobs, Proofs
+from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, Proofs
+from app.services.progress import JobDocument, PackageJob, PlanJob, ProofJob
+
+# === Bodies of requests: rules are a document as docs/plans.md describes it.
+
+
+MAX_RULES_TEXT = 50_000
+"""Longest text of rules. [characters] 25 times the examples; as YAML it takes seconds."""
+
+
+class PlanIn(StrictModel):
+    """A plan to make: the rules are a document as docs/plans.md describes it."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "L 560, plates every 100 m",
+                    "alignment_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "rules": {"version": 1, "plates": {"spacing_m": 100}},
+                }
+            ]
+        },
+    )
+
+    name: Name
+    alignment_id: Identifier
+    rules: dict[str, object]
+
+
+class PlanPreviewIn(StrictModel):
+    """Rules to try on an alignment."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "alignment_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "rules": {"version": 1, "plates": {"spacing_m": 50}},
+                }
+            ]
+        },
+    )
+
+    alignment_id: Identifier
+    rules: dict[str, object]
+
+
+class RulesTextIn(StrictModel):
+    """A document of rules as it stands in a file."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"text": "version: 1\nplates:\n  spacing_m: 50\n"}]})
+
+    text: str = Field(max_length=MAX_RULES_TEXT, description="YAML 1.2 or JSON.")
+
+
+class PlanPatch(StrictModel):
+    """What to change of a plan; new rules place and check it again."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"rules": {"version": 1, "plates": {"spacing_m": 50}}, "reason": "closer in the bends"}]
+        },
+    )
+
+    name: Name | None = None
+    rules: dict[str, object] | None = None
+    reason: Annotated[Text | None, Field(max_length=500)] = None
+
+
+class ProofIn(ProofTerms):
+    """What is driven, and how; every member has a default."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"drives": 20, "seed": 7, "conditions": ["day", "night+rain"]}, {}]}
+    )
+
 
 # === /v1/plan-rules and /v1/plan-previews: rules of plans, and what they would place.
 
@@ -110,51 +191,6 @@ def _schema() -> bytes:
     return orjson.dumps(rules_schema())
 
 
-# === /v1/plan-jobs: progress, results and cancelling of jobs about plans.
-
-
-job_router = Router("/v1/plan-jobs", "plans")
-
-JobId = Annotated[Identifier, Path(description="Id of the job.")]
-JobService = Annotated[PlanJobs, use_case(lambda cases: cases.plan_jobs)]
-
-
-def queued_response(job: PlanJobDocument, replayed: bool) -> Response:
-    """202 Accepted for a job that was queued."""
-    response = created_response(job, replayed, path="/v1/plan-jobs", status=202)
-    response.headers["Retry-After"] = "1"
-    return response
-
-
-@job_router.get("", READERS, responses=document_response(PlanJobPage))
-def list_plan_jobs(
-    request: Request,
-    caller: Caller,
-    jobs: JobService,
-    plan_id: Annotated[Identifier | None, Query(description="Jobs about this plan.")] = None,
-    state: JobState | None = None,
-    limit: PageSize = 100,
-    after: LastId = None,
-) -> Response:
-    """List jobs about plans.
-
-    Without their results, newest first.
-    """
-    page, last = jobs.page(caller, plan_id=plan_id, state=state, before=after, limit=limit)
-    return page_response(request, page, after=last)
-
-
-@job_router.get("/{job_id}", READERS, responses=document_response(PlanJobDocument, 404))
-def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
-    """Get a job about a plan.
-
-    With its progress, or its result.
-    """
-    document = jobs.get(caller, job_id)
-    waiting = document["state"] in ("queued", "running")
-    return json_response(document, headers={"Retry-After": "1"} if waiting else None)
-
-
 # === /v1/plans.
 
 
@@ -173,7 +209,7 @@ Service = Annotated[Plans, use_case(lambda cases: cases.plans)]
     status_code=201,
     responses={
         201: {"model": PlanDocument, "description": "Made"},
-        202: {"model": PlanJobDocument, "description": "Queued; Location leads to its progress and to the plan"},
+        202: {"model": PlanJob, "description": "Queued; Location leads to its progress and to the plan"},
         **problem_responses(404, 409),
     },
 )
@@ -193,10 +229,10 @@ def post_plan(
     """
     asked = (caller, wanted.name, wanted.alignment_id, wanted.rules, idempotency)
     as_job = wants_job(prefer) or making.is_long(caller, wanted.alignment_id)
-    document: PlanDocument | PlanJobDocument
+    document: PlanDocument | JobDocument
     document, replayed = making.request(*asked) if as_job else plans.make(*asked)
     if "attempts" in document:  # a repeated request gets the first response, whichever it was
-        return queued_response(cast("PlanJobDocument", document), replayed)
+        return queued_job(cast("JobDocument", document), replayed)
     return created_response(document, replayed, path="/v1/plans")
 
 
@@ -263,7 +299,7 @@ def get_plan_file(
     plans: Service,
     proofs: Annotated[Proofs, use_case(lambda cases: cases.proofs)],
     crs: Annotated[Text | None, Query(max_length=64, description="CRS of the stakeout.")] = None,
-    unit: Annotated[Literal["m", "ft-us", "ft-intl"] | None, Query(description="Unit of the stakeout.")] = None,
+    unit: Annotated[Unit | None, Query(description="Unit of the stakeout.")] = None,
 ) -> Response:
     """Download a file of a plan.
 
@@ -329,12 +365,10 @@ PackageService = Annotated[Packages, use_case(lambda cases: cases.packages)]
     "/{plan_id}/package",
     PLANNERS,
     status_code=202,
-    responses=document_response(
-        PlanJobDocument, 404, 409, status=202, description="Queued; Location leads to its progress"
-    ),
+    responses=document_response(PackageJob, 404, 409, status=202, description="Queued; Location leads to its progress"),
 )
 def post_package(
-    plan_id: PlanId, wanted: PackageIn, caller: Caller, packages: PackageService, idempotency: Idempotency
+    plan_id: PlanId, wanted: PackageOptions, caller: Caller, packages: PackageService, idempotency: Idempotency
 ) -> Response:
     """Pack all files of a plan.
 
@@ -342,7 +376,7 @@ def post_package(
 
     Every plate is read back from its drawing first. The package replaces the plan's earlier one.
     """
-    return queued_response(*packages.request(caller, plan_id, wanted.options(), idempotency))
+    return queued_job(*packages.request(caller, plan_id, wanted, idempotency))
 
 
 @package_router.get(
@@ -382,7 +416,7 @@ ProofService = Annotated[Proofs, use_case(lambda cases: cases.proofs)]
     PLANNERS,
     status_code=202,
     responses=document_response(
-        PlanJobDocument, 404, 409, 412, 428, status=202, description="Queued; Location leads to its progress"
+        ProofJob, 404, 409, 412, 428, status=202, description="Queued; Location leads to its progress"
     ),
 )
 def post_proof(
@@ -396,11 +430,11 @@ def post_proof(
     are listed and change nothing. The proof belongs to the markers as they are placed now: if other rules place them
     again in the meantime, the plan is not proved.
     """
-    return queued_response(*proofs.request(caller, plan_id, terms, version, idempotency))
+    return queued_job(*proofs.request(caller, plan_id, terms, version, idempotency))
 
 
 @proof_router.get(
-    "/{plan_id}/proof", READERS, responses={**document_response(ProofDocument, 404), **problem_responses(404)}
+    "/{plan_id}/proof", READERS, responses={**document_response(ProofReport, 404), **problem_responses(404)}
 )
 def get_proof(plan_id: PlanId, caller: Caller, proofs: ProofService) -> Response:
     """Get the report of a plan's latest proof.
@@ -411,3 +445,38 @@ def get_proof(plan_id: PlanId, caller: Caller, proofs: ProofService) -> Response
     """
     data, row = proofs.file(caller, plan_id, REPORT_FILE)
     return Response(data, media_type="application/json", headers={"ETag": f'"{row.version}-{REPORT_FILE}"'})
+
+
+# === /v1/radio-checks: whether markers along a road can be read in time, and lawfully.
+
+
+radio_router = Router("/v1/radio-checks", "cerpms")
+
+_RADIO_EXAMPLES: list[JsonValue] = [
+    {"radio": {"spreading_factor": 7, "bandwidth_hz": 500_000, "interval_s": 2.0}, "design_speed_m_s": 13.4},
+    {
+        "region": "EU868",
+        "radio": {"frequency_hz": 868_300_000, "bandwidth_hz": 125_000, "interval_s": 10.0, "power_dbm": 11.0},
+        "road": {"spacing_m": 24.384, "sides": 1},
+        "recommend": True,
+    },
+]
+
+
+@with_config(ConfigDict(extra="forbid", json_schema_extra={"examples": _RADIO_EXAMPLES}))
+@dataclass(frozen=True, slots=True)
+class RadioCheckIn(RadioPlan):
+    """A plan to check."""
+
+    recommend: Annotated[
+        Flag, Field(description="Also search for lawful settings that reach it; takes a second or two.")
+    ] = False
+
+
+@radio_router.post("", READERS, expensive=True, responses=document_response(RadioCheck))
+def post_radio_check(wanted: RadioCheckIn, caller: Caller) -> Response:
+    """Check the radios of CERPMs on a road.
+
+    Law, link, collisions, reading in time, battery. Nothing is stored.
+    """
+    return json_response(check_radio(wanted, recommend=wanted.recommend))

@@ -159,15 +159,6 @@ class RoadLanes(_Part):
     edge_style: Annotated[BoundaryStyle, Field(description="Paint at the edges.")] = BoundaryStyle.UNKNOWN
 
 
-class RoadStation(_Part):
-    """A calibration point; `chainage_m` runs along all parts, `ahead_m` is the measure after a jump. [m]"""
-
-    part: int
-    chainage_m: float
-    measure_m: float
-    ahead_m: float | None = None
-
-
 class RegisteredRoad(_Part):
     """A road of the registry with its lanes."""
 
@@ -182,7 +173,7 @@ class RegisteredRoad(_Part):
     # [m] of the positions' reference frame; None in documents that were written without it
     accuracy_m: float | None = None
     lanes: RoadLanes
-    calibration: list[RoadStation]
+    calibration: list[CalibrationPoint]
     parts: list[list[tuple[Longitude, Latitude]]]  # [deg] in WGS 84 / ITRF
 
 
@@ -228,8 +219,7 @@ def read_registered_road(data: bytes) -> AlignmentFile:
         lengths = np.asarray(_GEOD.inv(axis[:-1, 0], axis[:-1, 1], axis[1:, 0], axis[1:, 1])[2])
         chainages.append(start_m + np.concatenate([[0.0], np.cumsum(lengths)]))
         start_m = float(chainages[-1][-1])
-    points = [CalibrationPoint(p.part, p.chainage_m, p.measure_m, p.ahead_m) for p in road.calibration]
-    measures = calibrate(ranges_m, points)
+    measures = calibrate(ranges_m, road.calibration)
     earlier = EarlierTransformation(road.exact, road.note, road.accuracy_m)
     return AlignmentFile(
         "road",

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, Field, model_validator, with_config
 
 from app.errors import InvalidParameter
+from app.geodesy.systems import VerticalDatum
+from app.inputs import INPUT, Flag, Number, Text
+from app.markers.reading import Status
 
-FORMATS = ("csv", "geojson", "gpkg", "shapefile", "kml", "kmz", "gpx", "landxml", "jobxml", "dxf", "gsi")
 FIXED_LAYOUTS = {
     "pnezd": ("point", "northing", "easting", "height", "description"),
     "penzd": ("point", "easting", "northing", "height", "description"),
@@ -17,10 +19,8 @@ FIXED_LAYOUTS = {
     "enzd": ("easting", "northing", "height", "description"),
 }
 """Columns by position, by the name that survey software has for them."""
-LAYOUTS = (*FIXED_LAYOUTS, "named")
-ENCODINGS = ("utf-8", "utf-16", "windows-1252", "iso-8859-1", "iso-8859-2", "windows-1250", "cp437", "cp850")
-DUPLICATES = ("refuse", "store")
-METRES = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.3048}
+Unit = Literal["m", "ft-us", "ft-intl"]
+METRES: dict[str, float] = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.3048}
 """Metres to a unit of length: US survey foot and international foot (NIST SP 811)."""
 FEET = "ft"
 """Unit of a file that does not state which foot."""
@@ -28,32 +28,37 @@ TEXT_ROLES = ("point", "code", "description", "road", "side", "status")
 NUMBER_ROLES = ("heading_deg", "measure_m", "offset_m", "horizontal_rmse_m", "vertical_rmse_m")
 COORDINATE_ROLES = ("lon_deg", "lat_deg", "easting", "northing", "height")
 ROLES = (*COORDINATE_ROLES, *TEXT_ROLES, *NUMBER_ROLES)
-MATCHES = ("code", "nearest")
 MAX_AREA_DEG = 30.0
 """Largest side of a declared area: a larger one would check nothing. [deg]"""
 
 
+_Name = Annotated[Text, Field(min_length=1, max_length=200)]
+Accuracy = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6)]
+
+
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class ControlPoint:
     """A point that is known in a local grid and in the declared CRS."""
 
-    point: str  # its point number, which names it in reports and in the file
-    # `easting`, `northing`: in the CRS and its unit
-    easting: float
-    northing: float
-    # `local_easting`, `local_northing`: in the local grid, in the unit of the file; those of the row with the same
-    # point number without
-    local_easting: float | None = None
-    local_northing: float | None = None
+    point: Annotated[_Name, Field(description="Its point number.")]
+    easting: Annotated[Number, Field(description="In the CRS and its unit.")]
+    northing: Annotated[Number, Field(description="In the CRS and its unit.")]
+    # `local_easting`, `local_northing`: in the local grid, in the unit of the file
+    local_easting: Annotated[Number | None, Field(description="That of the row with this point number without.")] = None
+    local_northing: Annotated[Number | None, Field(description="That of the row with this point number without.")] = (
+        None
+    )
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class LocalGrid:
-    """How coordinates of a local grid are transformed to the declared CRS."""
+    """How coordinates of a local grid are transformed: a similarity transformation by least squares."""
 
-    control_points: tuple[ControlPoint, ...]
-    scale: str = "fixed"  # ``fixed`` (1, as for distances that are reduced to the grid) or ``free`` (estimated)
-    limit_m: float = 0.05  # [m] largest residual of a control point
+    control_points: Annotated[tuple[ControlPoint, ...], Field(min_length=2, max_length=100)]
+    scale: Annotated[Literal["fixed", "free"], Field(description="1, or estimated of at least three points.")] = "fixed"
+    limit_m: Annotated[Number, Field(gt=0, le=10, description="Largest residual of a control point. [m]")] = 0.05
 
     def __post_init__(self) -> None:
         needed = 2 if self.scale == "fixed" else 3
@@ -68,67 +73,83 @@ class LocalGrid:
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise InvalidParameter(
-                f"the control point {twice[:40]!r} is declared twice", field="local_grid.control_points",
-                limit="each point once", cure="leave one of the two out",
-            )  # fmt: skip
+                f"the control point {twice[:40]!r} is declared twice",
+                field="local_grid.control_points",
+                limit="each point once",
+                cure="leave one of the two out",
+            )
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
-class ImportDeclaration:
+class SurveyIn:
+    """Who surveyed, how, and how well."""
+
+    horizontal_rmse_m: Annotated[Accuracy | None, Field(description="Horizontal accuracy, RMSE. [m]")] = None
+    vertical_rmse_m: Annotated[Accuracy | None, Field(description="Vertical accuracy, RMSE. [m]")] = None
+    survey_method: Annotated[_Name | None, Field(description="How it was surveyed.")] = None
+    surveyor: Annotated[_Name | None, Field(description="Who surveyed.")] = None
+    instrument: Annotated[_Name | None, Field(description="With what.")] = None
+    check_points: Annotated[
+        int | None, Field(strict=True, ge=0, le=10**6, description="Points that the accuracy was checked at.")
+    ] = None
+
+
+class ImportDeclaration(BaseModel):
     """What is declared of a survey."""
 
-    format: str | None = None  # one of `FORMATS`; detected by the content if it is left out
-    # of CSV: one of `FIXED_LAYOUTS` (no header needed), or ``named`` columns; detected without
-    layout: str | None = None
-    # role to the column's name, or None where the file has no column of this role; common names are found without.
-    # Roles are `ROLES`.
-    columns: Mapping[str, str | None] = field(default_factory=dict)
-    layer: str | None = None  # of a GeoPackage or a DXF
-    # `decimal`, `delimiter`, `encoding`: of CSV; detected without
-    decimal: str | None = None
-    delimiter: str | None = None
-    encoding: str | None = None
-    # `crs`, `realization`, `epoch`, `vertical_datum`: frame of the coordinates. [epoch: decimal year]
-    crs: str | None = None
-    realization: str | None = None
-    epoch: float | None = None
-    vertical_datum: str | None = None
-    # `unit`, `height_unit`: ``m``, ``ft-us`` or ``ft-intl``; that of the CRS without
-    unit: str | None = None
-    height_unit: str | None = None
-    local_grid: LocalGrid | None = None  # where easting and northing are those of a local grid
-    ignore_heights: bool = False  # leave heights out
-    # [deg] west, south, east, north of a box that contains all rows
-    area_deg: tuple[float, float, float, float] | None = None
-    height_range_m: tuple[float, float] | None = None  # [m] lowest and highest plausible height
-    # `family`, `status`, `road`: of the markers
-    family: str = "plate"
-    status: str | None = None
-    road: str | None = None
-    # the survey finds registered markers as built: rows are matched, and moved markers get a new version
-    compare: bool = False
-    duplicates: str = "refuse"  # ``refuse`` what is already registered, or ``store`` it once more
-    match: str = "code"  # ``code`` or ``nearest``
-    tolerance_m: float = 0.1  # [m] residuals beyond it are reported
-    leave_out: tuple[int, ...] = ()  # numbers of rows, counted from 1, that are neither checked nor stored
-    # horizontal_rmse_m, vertical_rmse_m, survey_method, surveyor, instrument, check_points
-    survey: Mapping[str, Any] = field(default_factory=dict)
+    model_config = INPUT | {"frozen": True}
 
-    def __post_init__(self) -> None:
-        for name, value, allowed in (
-            ("format", self.format, (None, *FORMATS)),
-            ("layout", self.layout, (None, *LAYOUTS)),
-            ("decimal", self.decimal, (None, ".", ",")),
-            ("delimiter", self.delimiter, (None, ",", ";", "\t", "|", "space")),
-            ("encoding", self.encoding, (None, *ENCODINGS)),
-            ("duplicates", self.duplicates, DUPLICATES),
-            ("unit", self.unit, (None, *METRES)),
-            ("height_unit", self.height_unit, (None, *METRES)),
-            ("match", self.match, MATCHES),
-        ):
-            if value not in allowed:
-                known = ", ".join(repr(name) for name in allowed if name is not None)
-                raise InvalidParameter(f"there is no {name} {str(value)[:40]!r}", field=name, limit=known, cure=_CURE)
+    format: (
+        Literal["csv", "geojson", "gpkg", "shapefile", "kml", "kmz", "gpx", "landxml", "jobxml", "dxf", "gsi"] | None
+    ) = Field(None, description="Detected without.")
+    # one of `FIXED_LAYOUTS` (no header needed), or named columns
+    layout: Literal["named", "pnezd", "penzd", "nezd", "enzd"] | None = Field(
+        None, description="Columns of CSV; detected without."
+    )
+    columns: dict[_Name, Annotated[Text, Field(max_length=200)] | None] = Field(
+        default_factory=dict,
+        max_length=20,
+        description="Role to column; null or an empty text where no column has the role.",
+    )
+    layer: _Name | None = Field(None, description="Of a GeoPackage or a DXF.")
+    decimal: Literal[".", ","] | None = Field(None, description="Of CSV; detected without.")
+    delimiter: Literal[",", ";", "\t", "|", "space"] | None = Field(None, description="Of CSV; detected without.")
+    encoding: (
+        Literal["utf-8", "utf-16", "windows-1252", "iso-8859-1", "iso-8859-2", "windows-1250", "cp437", "cp850"] | None
+    ) = Field(None, description="Of CSV and GSI; detected without: UTF-8, UTF-16 or Windows-1252.")
+    crs: Annotated[Text, Field(max_length=100)] | None = Field(None, description="EPSG code or URN.")
+    realization: Annotated[Text, Field(min_length=1, max_length=64)] | None = None
+    epoch: Annotated[Number, Field(ge=1900, le=2200)] | None = None
+    vertical_datum: VerticalDatum | None = Field(
+        None, description="`ellipsoid`, or the datum of the heights; needed where there are any."
+    )
+    unit: Unit | None = Field(None, description="Of projected coordinates; the CRS's own without.")
+    height_unit: Unit | None = None
+    local_grid: LocalGrid | None = Field(None, description="Where easting and northing are of a local grid.")
+    ignore_heights: Flag = False
+    area_deg: tuple[Number, Number, Number, Number] | None = Field(
+        None, description="west, south, east, north that all rows lie in. [deg]"
+    )
+    height_range_m: tuple[Number, Number] | None = Field(None, description="Lowest and highest height that can be. [m]")
+    family: str = "plate"
+    status: Status | None = None
+    road: _Name | None = None
+    compare: Flag = Field(
+        False, description="The survey measures registered markers: residuals, and a new version of each."
+    )
+    duplicates: Literal["refuse", "store"] = Field(
+        "refuse", description="Whether rows that are already registered, and a file that was imported, are refused."
+    )
+    match: Literal["code", "nearest"] = "code"
+    tolerance_m: Annotated[Number, Field(gt=0, le=100)] = 0.1
+    survey: SurveyIn = Field(default_factory=SurveyIn)
+    leave_out: tuple[Annotated[int, Field(strict=True, ge=1, le=1_000_000)], ...] = Field(
+        (), max_length=1000, description="Numbers of rows that are neither checked nor stored."
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
         unknown = next((role for role in self.columns if role not in ROLES), None)
         if unknown is not None:
             raise InvalidParameter(
@@ -139,8 +160,7 @@ class ImportDeclaration:
             raise InvalidParameter(
                 "the lowest height is not below the highest", field="height_range_m", limit="low < high", cure=_CURE
             )
-        if not (math.isfinite(self.tolerance_m) and 0 < self.tolerance_m <= 100):
-            raise InvalidParameter("the tolerance is out of range", field="tolerance_m", limit="0 to 100 m", cure=_CURE)
+        return self
 
 
 _CURE = "docs/imports.md lists what can be declared"

@@ -146,10 +146,13 @@ def _detected(
             return column
         if refuted is None and evidence:
             refuted = warn(
-                None, role, "role_without_evidence", f"the column {shown} was not read as {role}: {evidence}",
+                None,
+                role,
+                "role_without_evidence",
+                f"the column {shown} was not read as {role}: {evidence}",
                 f"declare columns {{{role!r}: {shown}}} if it is, or {{{role!r}: null}} if it is not".replace("'", '"'),
                 (Change(f"columns.{role}", None),),
-            )  # fmt: skip
+            )
     if refuted is not None:
         roles.faults.append(refuted)
     return None

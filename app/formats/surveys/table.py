@@ -62,7 +62,8 @@ def warn(
     return Fault(row, field, code, message, proposal, Severity.WARNING, changes)
 
 
-class Detected(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Detected:
     """A property of a file that was not declared, with the evidence for it."""
 
     what: str  # the property, such as ``encoding`` or ``column of code``
@@ -434,9 +435,12 @@ def _fault_of(text: str, field: str, row: int, decimal: str) -> Fault:
         return Fault(row, field, "hemisphere_letter", f"{field} is {shown}: a letter in place of the sign", cure)
     if (found := _WITH_UNIT.fullmatch(text)) is not None:
         return Fault(
-            row, field, "unit_in_value", f"{field} is {shown}: a unit in the value",
+            row,
+            field,
+            "unit_in_value",
+            f"{field} is {shown}: a unit in the value",
             f"write {found[1]} and declare the unit of the column",
-        )  # fmt: skip
+        )
     if (found := _SEXAGESIMAL.fullmatch(text)) is not None:
         letter = (found[1] or found[5] or "").upper()
         cure = f"write {_decimal_degrees(found):.9f}" if letter != "O" else _OST_OR_OUEST

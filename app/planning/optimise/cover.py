@@ -180,9 +180,12 @@ def cheapest_cover(
         raise ValueError("a window has too few candidates")
     if np.all(gain >= need):
         chain = cheapest_chain(
-            chainage_m, cost, chainage_m + window_m,
-            first_before_m=min(window_m, length_m), last_after_m=max(length_m - window_m, 0.0),
-        )  # fmt: skip
+            chainage_m,
+            cost,
+            chainage_m + window_m,
+            first_before_m=min(window_m, length_m),
+            last_after_m=max(length_m - window_m, 0.0),
+        )
         assert chain is not None
         total = float(cost[chain].sum())
         return Cover(chain, total, total)

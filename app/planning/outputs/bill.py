@@ -193,14 +193,17 @@ def bill_document(bill: PlanBill) -> dict[str, object]:
             "currency": "USD",
             "rows": [
                 {
-                    "item": row.cost.item, "unit": row.cost.unit, "quantity": row.quantity,
-                    "unit_cost": [row.cost.low_usd, row.cost.high_usd], "cost": [row.low_usd, row.high_usd],
+                    "item": row.cost.item,
+                    "unit": row.cost.unit,
+                    "quantity": row.quantity,
+                    "unit_cost": [row.cost.low_usd, row.cost.high_usd],
+                    "cost": [row.low_usd, row.high_usd],
                     "source": row.cost.source,
                 }
                 for row in bill.comparisons
             ],
         },
-    }  # fmt: skip
+    }
 
 
 def write_bill_csv(bill: PlanBill) -> bytes:

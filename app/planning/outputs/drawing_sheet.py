@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, with_config
 
 from app.encoders.pdf import POINTS_PER_MM, Canvas, EmbeddedFont, PdfFile
+from app.inputs import INPUT, Text
 from app.markers.cerpm import LaneSide
 from app.markers.magnet import Polarity
 from app.planning.plan import PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
@@ -27,17 +30,20 @@ _BORDER_MM = 5.0  # of the grid reference; source: ISO 5457
 _LABELS_PT, _VALUES_PT = 5.0, 8.0
 
 
+DOCUMENT_TYPE = "Installation drawing"
+
+
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class TitleBlock:
     """What the title block of a set of drawings states; empty fields are left to be filled in by hand."""
 
-    owner: str = ""  # legal owner, as the agency's name
-    number: str = ""  # Identification number of the set, 16 characters
-    date: str = ""  # date of issue
-    creator: str = ""
-    approver: str = ""
-    title: str = ""
-    document_type: str = "Installation drawing"
+    owner: Annotated[Text, Field(max_length=80, description="Legal owner, as the agency's name.")] = ""
+    number: Annotated[Text, Field(max_length=80, description="Identification number of the set, 16 characters.")] = ""
+    date: Annotated[Text, Field(max_length=80, description="Date of issue.")] = ""
+    creator: Annotated[Text, Field(max_length=80)] = ""
+    approver: Annotated[Text, Field(max_length=80)] = ""
+    title: Annotated[Text, Field(max_length=80, description="Without, the name of the plan.")] = ""
 
 
 class SheetSet:
@@ -57,7 +63,7 @@ class SheetSet:
 
     def to_bytes(self) -> bytes:
         """The file; the same calls always give the same bytes."""
-        file = PdfFile(f"{self.block.document_type} {self.block.title}")
+        file = PdfFile(f"{DOCUMENT_TYPE} {self.block.title}")
         fonts = " ".join(f"/{name} {font.add_to(file)} 0 R" for name, font in self.fonts.items())
         resources = file.add(f"<< /Font << {fonts} >> >>".encode())
         for sheet in self._sheets:
@@ -105,8 +111,11 @@ def _draw_frame(sheet: Sheet) -> None:
     sheet.rectangle(left - _BORDER_MM, bottom - _BORDER_MM, right + _BORDER_MM, top + _BORDER_MM, 0.18)
     middle_x, middle_y = PAGE_MM[0] / 2, PAGE_MM[1] / 2
     for x, y, out_x, out_y in (
-        (left, middle_y, -1, 0), (right, middle_y, 1, 0), (middle_x, bottom, 0, -1), (middle_x, top, 0, 1),
-    ):  # fmt: skip
+        (left, middle_y, -1, 0),
+        (right, middle_y, 1, 0),
+        (middle_x, bottom, 0, -1),
+        (middle_x, top, 0, 1),
+    ):
         ends = [(x + k * out_x * _BORDER_MM, y + k * out_y * _BORDER_MM) for k in (-1, 1)]
         sheet.lines(ends, 0.7)
     columns, rows = int(PAGE_MM[0] // _FIELD_MM), int(PAGE_MM[1] // _FIELD_MM)
@@ -142,7 +151,7 @@ def draw_title_block(sheet: Sheet, block: TitleBlock, *, subtitle: str, scale: s
     sheet.text(left + 61.5, top - 8.5, block.title, 11, bold=True, width=117)
     sheet.text(left + 61.5, top - 14.5, subtitle, 8, width=117)
     for x, width, label, value in (
-        (0.0, 60.0, "Document type", block.document_type),
+        (0.0, 60.0, "Document type", DOCUMENT_TYPE),
         (60.0, 40.0, "Creator", block.creator),
         (100.0, 40.0, "Approval person", block.approver),
         (140.0, 40.0, "Date of issue", block.date),

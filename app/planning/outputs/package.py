@@ -6,11 +6,13 @@ The same plan and options give the same files in the same order, whichever proce
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cache, cached_property, partial
+from typing import Annotated
 
 import orjson
+from pydantic import Field, JsonValue, with_config
 
 from app.encoders.magnet import MagnetLayout, SheetFormat, place_line, place_tag, write_sheet
 from app.encoders.plate import (
@@ -27,11 +29,14 @@ from app.encoders.plate import (
 from app.encoders.plate.bundle import quality_csv
 from app.encoders.plate.face import reference_text
 from app.errors import InvalidParameter, NotFound
+from app.formats.surveys.declaration import Unit
 from app.geodesy import UNFIT_TEXT, LocalizationGrade
+from app.inputs import INPUT, Flag, Text, Whole
 from app.markers.magnet import LineStyle
 from app.planning.magnet_checks import Site, drilling_sheet
 from app.planning.magnet_stretches import even_stretches, lane_around, spacing_of
 from app.planning.outputs.bill import plan_bill, write_bill_csv, write_report, write_schedule_csv, write_trade_off_csv
+from app.planning.outputs.drawing_sheet import TitleBlock
 from app.planning.outputs.hd_lanelet2 import write_lanelet2
 from app.planning.outputs.hd_map import map_of_plan
 from app.planning.outputs.hd_opendrive import OpenDriveMap
@@ -43,7 +48,7 @@ from app.planning.outputs.plan_document import (
     write_plan_programs_json,
 )
 from app.planning.outputs.stakeout import StakeoutFormat, plan_stakeout, write_stakeout
-from app.planning.outputs.strip_map import DrawingOptions, Drawings
+from app.planning.outputs.strip_map import Drawings
 from app.planning.plan import Optimum, Plan, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag, TradeOffPoint
 from app.roads.lane_line import LaneLine
 
@@ -54,16 +59,17 @@ DrawTradeOff = Callable[[Sequence[TradeOffPoint], str], str]
 """Points of a trade-off and the currency to an SVG picture."""
 
 
+@with_config(INPUT)
 @dataclass(frozen=True, slots=True)
 class OutputOptions:
-    """How a plan is handed out."""
+    """How the files of a plan are written."""
 
-    # `crs`, `unit`: of the stakeout; see `plan_stakeout`
-    crs: str | None = None
-    unit: str | None = None
-    drawings: DrawingOptions = field(default_factory=DrawingOptions)
-    # draws the trade-off of an optimised plan as SVG; without, there is no picture of it
-    draw_trade_off: DrawTradeOff | None = None
+    crs: Annotated[Text | None, Field(max_length=64, description="Projected CRS of the stakeout.")] = None
+    unit: Annotated[Unit | None, Field(description="Of the stakeout.")] = None
+    scale: Annotated[
+        Whole | None, Field(ge=1, le=100_000, description="Of the drawings: 250, 500, 1000, 2000 or 5000.")
+    ] = None
+    title_block: TitleBlock = field(default_factory=TitleBlock)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +89,7 @@ MEDIA_TYPES = {
 """Media types of the files by the ends of their names."""
 
 
-def write_plan_file(plan: Plan, name: str, options: OutputOptions | None = None) -> bytes:
+def write_plan_file(plan: Plan, name: str, options: OutputOptions, draw_trade_off: DrawTradeOff | None = None) -> bytes:
     """One file of a plan.
 
     Raises
@@ -94,7 +100,7 @@ def write_plan_file(plan: Plan, name: str, options: OutputOptions | None = None)
         As `plan_files`.
     """
     names = []
-    for file in plan_files(plan, options):
+    for file in plan_files(plan, options, draw_trade_off):
         if file.name == name:
             return file.write()
         names.append(file.name)
@@ -103,10 +109,17 @@ def write_plan_file(plan: Plan, name: str, options: OutputOptions | None = None)
     )
 
 
-def plan_files(plan: Plan, options: OutputOptions | None = None) -> Iterator[OutputFile]:
+def plan_files(
+    plan: Plan, options: OutputOptions | None = None, draw_trade_off: DrawTradeOff | None = None
+) -> Iterator[OutputFile]:
     """Files of a plan in the order in which they are written; without markers, those that need none.
 
     A map in OpenDRIVE is left out where a marker lies beside no lane; the report then has the reason.
+
+    Parameters
+    ----------
+    draw_trade_off : callable, optional
+        Draws the trade-off of an optimised plan as SVG; without, there is no picture of it.
 
     Raises
     ------
@@ -115,14 +128,14 @@ def plan_files(plan: Plan, options: OutputOptions | None = None) -> Iterator[Out
     """
     options = options or OutputOptions()
     stakeout = plan_stakeout(plan, options.crs, options.unit) if plan.markers else None
-    drawings = Drawings(plan, options.drawings) if plan.markers else None
+    drawings = Drawings(plan, options.title_block, options.scale) if plan.markers else None
     yield OutputFile("plan.json", lambda: write_plan(plan))
     yield OutputFile("plan.geojson", lambda: write_plan_geojson(plan))
     opendrive = cache(lambda: _opendrive(plan))
     yield OutputFile("report.md", lambda: write_report(plan, _left_out(opendrive())))
     yield OutputFile("bill.csv", lambda: write_bill_csv(plan_bill(plan)))
     if plan.optimum is not None:
-        yield from _trade_off_files(plan.optimum, plan.rules.costs.currency, options)
+        yield from _trade_off_files(plan.optimum, plan.rules.costs.currency, draw_trade_off)
     yield OutputFile("schedule.csv", lambda: write_schedule_csv(plan))
     if drawings is not None:
         for name in drawings.names:
@@ -153,8 +166,7 @@ def _left_out(road_map: OpenDriveMap | InvalidParameter) -> dict[str, str]:
     return {"map.xodr": road_map.message} if isinstance(road_map, InvalidParameter) else {}
 
 
-def _trade_off_files(optimum: Optimum, currency: str, options: OutputOptions) -> Iterator[OutputFile]:
-    draw = options.draw_trade_off
+def _trade_off_files(optimum: Optimum, currency: str, draw: DrawTradeOff | None) -> Iterator[OutputFile]:
     yield OutputFile("trade-off.csv", lambda: write_trade_off_csv(optimum, currency))
     if draw is not None:
         yield OutputFile("trade-off.svg", lambda: draw(optimum.table, currency).encode())
@@ -171,6 +183,17 @@ PLATES_A_PART, SHEETS_A_PART, QUALITY_A_PART = 20, 20, 300
 megabytes; a quality sheet of 101 pages."""
 MAX_SHEET_MAGNETS = 1000
 """Magnets of a line on one drilling sheet. Source: those of one marker, `app.families.magnet.layouts.MAX_MAGNETS`."""
+
+
+_EXAMPLES: list[JsonValue] = [
+    {
+        "crs": "EPSG:25832",
+        "scale": 500,
+        "title_block": {"owner": "Example Road Agency", "date": "2026-11-22"},
+        "formats": ["pdf", "dxf"],
+    },
+    {},
+]
 
 
 class PartKind(StrEnum):
@@ -193,20 +216,24 @@ class PackagePart:
     stop: int = 0
 
 
+@with_config(INPUT | {"json_schema_extra": {"examples": _EXAMPLES}})
 @dataclass(frozen=True, slots=True)
-class PackageOptions:
-    """How a plan is handed out."""
+class PackageOptions(OutputOptions):
+    """How a plan is handed out; every member may be left out."""
 
-    outputs: OutputOptions = field(default_factory=OutputOptions)
-    formats: tuple[ArtworkFormat, ...] = (ArtworkFormat.PDF, ArtworkFormat.SVG)  # files of each plate
-    artwork: ArtworkOptions = field(default_factory=ArtworkOptions)
+    formats: Annotated[tuple[ArtworkFormat, ...], Field(min_length=1, max_length=4, description="Of each plate.")] = (
+        ArtworkFormat.PDF,
+        ArtworkFormat.SVG,
+    )
+    heaters: Annotated[Flag, Field(description="Heating tracks under dark units.")] = False
+    leds: Annotated[Flag, Field(description="Light sources under light units.")] = False
 
 
 class Package:
-    """A plan and options, with what parts share; one a process."""
+    """A plan and options, with what parts share; one a process. `draw_trade_off` is as of `plan_files`."""
 
-    def __init__(self, plan: Plan, options: PackageOptions) -> None:
-        self.plan, self.options = plan, options
+    def __init__(self, plan: Plan, options: PackageOptions, draw_trade_off: DrawTradeOff | None = None) -> None:
+        self.plan, self.options, self._draw_trade_off = plan, options, draw_trade_off
 
     def check(self) -> None:
         """Check the options without writing a file.
@@ -217,13 +244,13 @@ class Package:
             They do not fit the plan.
         """
         if self.plan.markers:
-            outputs = self.options.outputs
+            options = self.options
             try:
-                plan_stakeout(replace(self.plan, markers=self.plan.markers[:1]), outputs.crs, outputs.unit)
+                plan_stakeout(replace(self.plan, markers=self.plan.markers[:1]), options.crs, options.unit)
             except InvalidParameter as error:
                 error.field = (error.field or "crs").removeprefix("position.")
                 raise
-            Drawings(self.plan, outputs.drawings)
+            Drawings(self.plan, options.title_block, options.scale)
 
     def parts(self) -> list[PackagePart]:
         """All parts in the order of their files; the manifest comes last and is none of them."""
@@ -265,13 +292,7 @@ class Package:
             "plan": self.plan.name,
             "counts": self.plan.counts,
             "read_back": len(self._plates),
-            "options": {
-                "crs": self.options.outputs.crs,
-                "unit": self.options.outputs.unit,
-                "drawings": asdict(self.options.outputs.drawings),
-                "formats": [str(form) for form in self.options.formats],
-                **asdict(self.options.artwork),
-            },
+            "options": self.options,
             "files": entries,
         }
         return orjson.dumps(document, option=orjson.OPT_INDENT_2)
@@ -280,7 +301,7 @@ class Package:
 
     @cached_property
     def _files(self) -> list[OutputFile]:
-        return list(plan_files(self.plan, self.options.outputs))
+        return list(plan_files(self.plan, self.options, self._draw_trade_off))
 
     @cached_property
     def _plates(self) -> list[PlannedMarker]:
@@ -312,9 +333,9 @@ class Package:
 
     def _artwork(self, marker: PlannedMarker, read: PlateReader) -> Iterator[tuple[str, bytes]]:
         order = self._order(marker)
-        drawing = encode_plate(order, self.options.artwork)
+        drawing = encode_plate(order, ArtworkOptions(self.options.heaters, self.options.leds))
         prove_plate(drawing, order.code, order.geometry, read)
-        for form in self.options.formats:
+        for form in dict.fromkeys(self.options.formats):
             yield f"artwork/{order.plate_id}.{form}", write_artwork(drawing, form, compress=False).content
 
     def _quality(self, part: PackagePart) -> list[tuple[str, bytes]]:

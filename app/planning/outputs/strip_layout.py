@@ -151,9 +151,11 @@ def cut_strips(plan: Plan, scale: int | None = None) -> tuple[Strip, ...]:
     """
     if scale is not None and scale not in SCALES:
         raise InvalidParameter(
-            f"there is no scale 1 : {scale}", field="scale", limit=", ".join(f"1 : {one}" for one in SCALES),
+            f"there is no scale 1 : {scale}",
+            field="scale",
+            limit=", ".join(f"1 : {one}" for one in SCALES),
             cure="choose one of these",
-        )  # fmt: skip
+        )
     references = list(find_references(plan))
     if scale is not None:
         return _cut(references, scale)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -17,6 +17,7 @@ from app.planning.outputs.bill import counts_sentence, finding_figures, verdict_
 from app.planning.outputs.drawing_sheet import (
     BLACK,
     BLUE,
+    DOCUMENT_TYPE,
     FRAME_MM,
     GREEN,
     GREY,
@@ -53,16 +54,6 @@ _LINES: tuple[tuple[str, float, str, tuple[int, ...]], ...] = (
 _KEY_MM = (24.0, 47.0)  # left and top of the key
 
 
-@dataclass(frozen=True, slots=True)
-class DrawingOptions:
-    """How drawings are made."""
-
-    # owner, number, date and persons; title and number follow from the plan where they are empty
-    block: TitleBlock = field(default_factory=TitleBlock)
-    # Denominator, one of `app.planning.outputs.strip_layout.SCALES`; chosen by the number of sheets if None
-    scale: int | None = None
-
-
 class Drawings:
     """Installation drawings of a plan, in files of at most a hundred sheets.
 
@@ -70,6 +61,10 @@ class Drawings:
     ----------
     plan : Plan
         With markers.
+    block : TitleBlock, optional
+        Owner, date and persons; title and number follow from the plan where they are empty.
+    scale : int, optional
+        Denominator, one of `app.planning.outputs.strip_layout.SCALES`; chosen by the number of sheets without.
 
     Raises
     ------
@@ -77,12 +72,12 @@ class Drawings:
         There is no such scale, or it takes more than a thousand sheets.
     """
 
-    def __init__(self, plan: Plan, options: DrawingOptions | None = None) -> None:
-        options = options or DrawingOptions()
-        number = options.block.number or f"WM-{zlib.crc32(repr((plan.name, plan.counts)).encode()):08X}"
+    def __init__(self, plan: Plan, block: TitleBlock | None = None, scale: int | None = None) -> None:
+        block = block or TitleBlock()
+        number = block.number or f"WM-{zlib.crc32(repr((plan.name, plan.counts)).encode()):08X}"
         self._plan = plan
-        self._block = replace(options.block, title=options.block.title or plan.name, number=number)
-        self._strips = cut_strips(plan, options.scale)
+        self._block = replace(block, title=block.title or plan.name, number=number)
+        self._strips = cut_strips(plan, scale)
         pages = [self._strips[k : k + _ROWS] for k in range(0, len(self._strips), _ROWS)]
         self._count = len(pages) + 1
         self._sheet_of = {strip.number: k + 2 for k, page in enumerate(pages) for strip in page}
@@ -169,7 +164,7 @@ def _draw_foot(sheet: Sheet, plan: Plan, scale: int | None) -> None:
 
 def _draw_title_sheet(sheet: Sheet, plan: Plan, block: TitleBlock, strips: Sequence[Strip], count: int) -> None:
     sheet.text(_MAP_MM[0], 272, plan.name, 22, bold=True, width=240)
-    sheet.text(_MAP_MM[0], 265.5, f"{block.document_type}s: {counts_sentence(plan)}", 9, width=240)
+    sheet.text(_MAP_MM[0], 265.5, f"{DOCUMENT_TYPE}s: {counts_sentence(plan)}", 9, width=240)
     _draw_index_map(sheet, plan, strips)
     _draw_facts(sheet, plan, strips)
     _draw_foot(sheet, plan, None)
@@ -259,14 +254,18 @@ def _draw_facts(sheet: Sheet, plan: Plan, strips: Sequence[Strip]) -> None:
         ("Positions", str(road.grade)),
         ("Heights", datum),
         ("Checks", checks),
-        ("Left out, moved", f"{sum(m.moved_m is None for m in plan.left_out)}, "
-                            f"{sum(m.moved_m is not None for m in plan.left_out)}"),
+        (
+            "Left out, moved",
+            f"{sum(m.moved_m is None for m in plan.left_out)}, {sum(m.moved_m is not None for m in plan.left_out)}",
+        ),
         ("Strips", f"{len(strips)} at 1 : {strips[0].scale}" if strips else "0"),
-    ]  # fmt: skip
+    ]
     hole = plan.rules.installation
     if hole.hole_diameter_mm is not None or hole.hole_depth_mm is not None:
-        sizes = [f"diameter {hole.hole_diameter_mm:g} mm" if hole.hole_diameter_mm else "",
-                 f"depth {hole.hole_depth_mm:g} mm" if hole.hole_depth_mm else ""]  # fmt: skip
+        sizes = [
+            f"diameter {hole.hole_diameter_mm:g} mm" if hole.hole_diameter_mm else "",
+            f"depth {hole.hole_depth_mm:g} mm" if hole.hole_depth_mm else "",
+        ]
         rows.append(("Holes for magnets", ", ".join(size for size in sizes if size)))
     for label, value in rows:
         sheet.text(x, y, label, 7, colour=GREY)

@@ -31,7 +31,15 @@ from app.planning.plan import (
     PlannedTag,
 )
 from app.planning.plate_view import camera_of, project_road
-from app.planning.radio_checks import INTERVALS_S, PreviewRule, RadioCheck, RadioPlan, check_radio, recommend_settings
+from app.planning.radio_checks import (
+    INTERVALS_S,
+    EvenRoad,
+    PreviewRule,
+    RadioCheck,
+    RadioPlan,
+    check_radio,
+    recommend_settings,
+)
 from app.planning.rules import CameraRules, CerpmRules, PlateRules, TagRules
 from app.radio.reception import MAX_MARKERS, SPACINGS_M, Air, RoadMarkers
 from app.radio.regulation import LAWS, region_at
@@ -121,7 +129,7 @@ def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterat
     radio = _radio_plan(plan, cerpms, rules, plan.radio or _first_settings(rules))
     markers, busiest = _busiest(cerpms, radio.air)
     check = check_radio(replace(radio, markers=markers))
-    settings = radio.settings
+    settings = radio.radio
     setting = f"SF{settings.spreading_factor}, {settings.bandwidth_hz / 1000:g} kHz, every {settings.interval_s:g} s, "
     setting += f"{settings.channels} channels: "
     for finding in check.checks:
@@ -165,18 +173,20 @@ def radio_settings(plan: Plan) -> RadioSettings | None:
         return None
     if rules.spreading_factor is not None and rules.interval_s is not None:
         return replace(
-            _first_settings(rules), spreading_factor=rules.spreading_factor, interval_s=rules.interval_s,
+            _first_settings(rules),
+            spreading_factor=rules.spreading_factor,
+            interval_s=rules.interval_s,
             bandwidth_hz=rules.bandwidth_hz,
-        )  # fmt: skip
+        )
     mean = _radio_plan(plan, cerpms, rules, _first_settings(rules))
     found = _recommended(mean)
     markers, _marker = _busiest(cerpms, found.air)
     real = replace(found, markers=markers)
     if check_radio(real).read_probability >= real.min_probability:
-        return found.settings
-    farthest = replace(mean.settings, spreading_factor=SPREADING_FACTORS[-1], interval_s=INTERVALS_S[-1])
-    markers, _marker = _busiest(cerpms, replace(mean, settings=farthest).air)
-    return _recommended(replace(mean, markers=markers)).settings
+        return found.radio
+    farthest = replace(mean.radio, spreading_factor=SPREADING_FACTORS[-1], interval_s=INTERVALS_S[-1])
+    markers, _marker = _busiest(cerpms, replace(mean, radio=farthest).air)
+    return _recommended(replace(mean, markers=markers)).radio
 
 
 def _first_settings(rules: CerpmRules) -> RadioSettings:
@@ -189,18 +199,20 @@ def _radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules, 
     length_m = sum(plan.alignment.lane(name).length_m for name in lanes)
     spacing_m = min(max(2 * length_m / len(cerpms) / len(lanes), SPACINGS_M[0]), SPACINGS_M[1])
     made = RadioPlan(
-        settings, rules.region or _DEFAULT_REGION, spacing_m=spacing_m,
+        settings,
+        rules.region or _DEFAULT_REGION,
+        EvenRoad(spacing_m),
         design_speed_m_s=max(float(lane.design_speed_m_s.max()) for lane in plan.alignment.lanes),
         preview=PreviewRule(distance_m=rules.preview_m),
-    )  # fmt: skip
+    )
     return replace(made, receiver=replace(made.receiver, channels=max(settings.channels, made.receiver.channels)))
 
 
 def _recommended(wanted: RadioPlan) -> RadioPlan:
     """The plan with recommended settings, or as it is where none are lawful."""
-    settings = recommend_settings(wanted).settings or wanted.settings
+    settings = recommend_settings(wanted).radio or wanted.radio
     receiver = replace(wanted.receiver, channels=max(settings.channels, wanted.receiver.channels))
-    return replace(wanted, settings=settings, receiver=receiver)
+    return replace(wanted, radio=settings, receiver=receiver)
 
 
 def _collisions(check: RadioCheck, rules: CerpmRules, busiest: PlannedMarker) -> PlanFinding:

@@ -287,9 +287,12 @@ def render_view(
     corners = truth.corners_px if truth.partly_in_view else np.empty((0, 2))
     reading, confidence = _read_view(frame.image, code, geometry)
     return CameraView(
-        frame.jpeg, tuple((round(x, 1), round(y, 1)) for x, y in corners.tolist()), reading, confidence,
+        frame.jpeg,
+        tuple((round(x, 1), round(y, 1)) for x, y in corners.tolist()),
+        reading,
+        confidence,
         drawn.exposure_s,
-    )  # fmt: skip
+    )
 
 
 def _read_view(image: npt.NDArray[np.uint8], code: PlateCode, geometry: PlateGeometry) -> tuple[ViewReading, float]:

@@ -320,9 +320,11 @@ def read_tag(one: MagnetPass) -> tuple[bool, list[float] | None, list[str]]:
 def _tag_cause(one: MagnetPass) -> str:
     slower = replace(one, speed_m_s=_SLOWER * one.speed_m_s)
     tries = (
-        ("neighbour magnet", replace(one, lines=())), ("bend", replace(one, bends=False)), ("speed", slower),
+        ("neighbour magnet", replace(one, lines=())),
+        ("bend", replace(one, bends=False)),
+        ("speed", slower),
         ("clearance", replace(one, clearance_m=min(one.clearance_m, 0.16))),
-    )  # fmt: skip
+    )
     for cause, easier in tries:
         if read_tag(easier)[0]:
             return cause

@@ -9,21 +9,19 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Annotated, TypedDict
 
 import numpy as np
+import orjson
 from pydantic import BaseModel, ConfigDict, Field, field_validator
+from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
 from app.formats.text import TableWriter
+from app.inputs import Number, Whole
 from app.planning.plan import Plan, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
 from app.planning.rules import CameraRules
 
 # === Terms of a proof: how many drives, of which vehicles, in which conditions; and the units that it is divided into.
-
-
-Whole = Annotated[int, Field(strict=True)]
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
 class Condition(StrEnum):
@@ -297,6 +295,21 @@ class DriveResult:
     refusals: tuple[str, ...] = ()  # why stretches have no path
 
 
+class WrongInDrive(WrongReading):
+    """A wrong reading, and the drive that it was made in; the marker is 0 beside line magnets."""
+
+    drive: int
+
+
+PROOF_FORMAT = "waymark-proof/1"
+NOTE = (
+    "Simulated drives: rates are of passes, weighted by strata where markers are sampled; intervals are Wilson's of "
+    "95 %, which take passes as independent. Light, wear and dirt are drawn from the ranges of "
+    "app/simulation/conditions.py."
+)
+"""What the figures are, in every report."""
+
+
 @dataclass(frozen=True, slots=True)
 class ProofReport:
     """What simulated vehicles read of a plan."""
@@ -305,14 +318,20 @@ class ProofReport:
     terms: ProofTerms
     complete: bool  # all units were computed
     rates: tuple[ReadRate, ...]  # by kind, over all drives first and then by condition
-    markers: tuple[MarkerProof, ...]  # those that were driven over, by number
     drives: tuple[DriveResult, ...]  # by drive and lane
-    wrong: tuple[tuple[int, int, str], ...]
+    weak: tuple[int, ...]  # numbers of the markers that are read too rarely
+    wrong: tuple[WrongInDrive, ...]
+    markers: tuple[MarkerProof, ...]  # those that were driven over, by number
+    format: str = PROOF_FORMAT
+    note: str = NOTE
 
-    @property
-    def weak(self) -> tuple[MarkerProof, ...]:
+    def list_weak(self) -> list[MarkerProof]:
         """Markers that are read too rarely."""
-        return tuple(marker for marker in self.markers if marker.weak)
+        return [marker for marker in self.markers if marker.weak]
+
+    def write(self, option: int = 0) -> bytes:
+        """The report as JSON, with options of orjson."""
+        return orjson.dumps(self, lambda terms: terms.model_dump(mode="json"), option)
 
 
 def wilson(rate: float, count: float) -> tuple[float, float]:
@@ -329,15 +348,17 @@ def summarize(plan: Plan, terms: ProofTerms, results: Iterable[UnitResult], *, c
     """The report of a proof from the results of its units, in any order."""
     units = sorted(results, key=lambda unit: unit["key"])
     drives = sorted({(unit["drive"], unit["lane"]) for unit in units})
-    wrong = sorted((unit["drive"], one["marker"], one["text"]) for unit in units for one in unit["wrong"])
+    wrong = [WrongInDrive(drive=unit["drive"], **one) for unit in units for one in unit["wrong"]]
+    markers = _markers(plan, terms, units)
     return ProofReport(
         plan.name,
         terms,
         complete,
         _rates(units),
-        _markers(plan, terms, units),
         tuple(_drive(plan, terms, drive, lane, units) for drive, lane in drives),
-        tuple(wrong),
+        tuple(marker.number for marker in markers if marker.weak),
+        tuple(sorted(wrong, key=lambda one: (one["drive"], one["marker"], one["text"]))),
+        markers,
     )
 
 
@@ -449,34 +470,6 @@ def _longest_gap(
 
 def _rms(values: Sequence[float]) -> float | None:
     return math.sqrt(sum(value**2 for value in values) / len(values)) if values else None
-
-
-# === The report of a proof as a JSON document and as a table of markers.
-
-
-PROOF_FORMAT = "waymark-proof/1"
-NOTE = (
-    "Simulated drives: rates are of passes, weighted by strata where markers are sampled; intervals are Wilson's of "
-    "95 %, which take passes as independent. Light, wear and dirt are drawn from the ranges of "
-    "app/simulation/conditions.py."
-)
-"""What the figures are, in every document."""
-
-
-def report_document(report: ProofReport) -> dict[str, object]:
-    """The report as it is written."""
-    return {
-        "format": PROOF_FORMAT,
-        "plan": report.plan,
-        "terms": report.terms.model_dump(mode="json"),
-        "complete": report.complete,
-        "note": NOTE,
-        "rates": report.rates,
-        "drives": report.drives,
-        "weak": [marker.number for marker in report.weak],
-        "wrong": [{"drive": drive, "marker": marker, "text": text} for drive, marker, text in report.wrong],
-        "markers": report.markers,
-    }
 
 
 def markers_csv(report: ProofReport) -> str:

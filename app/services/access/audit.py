@@ -15,12 +15,16 @@ from typing_extensions import TypedDict
 from app.errors import InvalidParameter, NotFound
 from app.registry import agencies
 from app.registry import audit as store
-from app.registry.audit import Author, ChainReport, EntryFilter, Fault, check_history
+from app.registry.audit import AuditFault, Author, ChainReport, EntryFilter, check_history
 from app.registry.database import Database
 from app.services.access.access import Caller, Scope
 from app.services.documents import document_of
 
 # === What the API returns about keys and the audit log.
+
+
+MAX_FAULTS = 1000
+"""Faults that the result of a verification lists; all are counted."""
 
 
 class KeyDocument(TypedDict):
@@ -48,6 +52,16 @@ class KeyPage(TypedDict):
     """A page of keys; the Link header leads to the next one."""
 
     items: list[KeyDocument]
+
+
+class VerificationResult(TypedDict):
+    """What was gone through, and what is not as it was written."""
+
+    entries: Annotated[int, Field(description="Entries of the log.")]
+    versions: Annotated[int, Field(description="Versions of markers.")]
+    head: Annotated[str | None, Field(description="NUMBER:HASH of the last entry; keep it elsewhere.")]
+    fault_count: int
+    faults: Annotated[list[AuditFault], Field(description=f"The first {MAX_FAULTS}.")]
 
 
 class AgencyDocument(TypedDict):
@@ -180,7 +194,7 @@ class AuditLog:
         agency: str | None = None,
         expected_head: tuple[int, str] | None = None,
         verified_heads: Mapping[str, tuple[int, str]] = MappingProxyType({}),
-    ) -> Iterator[tuple[str, ChainReport, Iterator[Fault]]]:
+    ) -> Iterator[tuple[str, ChainReport, Iterator[AuditFault]]]:
         """For each agency, or the one of this name: its name, what was gone through, and the faults as they are found.
 
         Parameters

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timedelta
-from typing import Annotated, NotRequired, cast
+from datetime import timedelta
+from typing import Annotated, NotRequired
 
 from pydantic import ConfigDict, Field
 from typing_extensions import TypedDict
@@ -11,49 +11,19 @@ from typing_extensions import TypedDict
 from app.errors import Conflict, InvalidParameter
 from app.registry import audit as log
 from app.registry import jobs as store
-from app.registry.audit import ChainReport, check_history
+from app.registry.audit import AuditFault, ChainReport, check_history
 from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState, new_job
+from app.registry.jobs import UNFINISHED, JobKind, new_job
 from app.services.access.access import Caller
-from app.services.access.audit import parse_head
-from app.services.documents import ErrorDocument, document_of
+from app.services.access.audit import MAX_FAULTS, VerificationResult, parse_head
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Clock, JobQueue
+from app.services.progress import JobDocument, job_document
 
-_MAX_FAULTS = 1000
 _NEARLY = 0.99
 """Progress of a verification that has gone through everything, and is not stored yet."""
-
-
-class AuditFaultDocument(TypedDict):
-    """Something that is not as it was written."""
-
-    where: str
-    what: str
-
-
-class VerificationResult(TypedDict):
-    """What was gone through, and what is not as it was written."""
-
-    entries: Annotated[int, Field(description="Entries of the log.")]
-    versions: Annotated[int, Field(description="Versions of markers.")]
-    head: Annotated[str | None, Field(description="NUMBER:HASH of the last entry; keep it elsewhere.")]
-    fault_count: int
-    faults: Annotated[list[AuditFaultDocument], Field(description=f"The first {_MAX_FAULTS}.")]
-
-
-class VerificationDocument(TypedDict):
-    """A verification of the agency's log: a job."""
-
-    id: str
-    state: JobState
-    progress: Annotated[float, Field(description="0 to 1.")]
-    created_at: datetime
-    finished_at: datetime | None
-    error: Annotated[ErrorDocument | None, Field(description="Why there is no result.")]
-    result: VerificationResult | None
 
 
 class VerificationInput(TypedDict):
@@ -80,7 +50,7 @@ class AuditVerifications:
 
     def request(
         self, caller: Caller, wanted: VerificationInput, key: IdempotencyKey | None
-    ) -> tuple[VerificationDocument, bool]:
+    ) -> tuple[JobDocument, bool]:
         """Queue a verification; returns its job, and whether the request was made before with this key.
 
         Raises
@@ -109,24 +79,14 @@ class AuditVerifications:
                     cure=f"wait for it, or cancel it: POST /v1/jobs/{other.id}/cancel",
                 )
             store.add_job(connection, job)
-            document = answer.store(verification_document(job))
+            document = answer.store(job_document(job, now))
         self._queue.submit(job.id, agency_id, JobKind.AUDIT)
         return document, False
-
-    def get(self, caller: Caller, job_id: str) -> VerificationDocument:
-        """A verification, with its result once it is done.
-
-        Raises
-        ------
-        NotFound
-        """
-        with self._database.read() as connection:
-            return verification_document(store.get_job(connection, caller.agency_id, JobKind.AUDIT, job_id))
 
     def run(self, job: RunningJob) -> None:
         """Verify the log of the job's agency; the handler of jobs of the kind `JobKind.AUDIT`."""
         expected = job.row.input["expected_head"]
-        report, faults, count = ChainReport(), list[AuditFaultDocument](), 0
+        report, faults, count = ChainReport(), list[AuditFault](), 0
         with self._database.read(long=True) as connection:
             total = log.count_history(connection, job.row.agency_id)
 
@@ -138,8 +98,8 @@ class AuditVerifications:
             head = parse_head(expected) if expected is not None else None
             for fault in check_history(connection, job.row.agency_id, report, head):
                 count += 1
-                if count <= _MAX_FAULTS:
-                    faults.append({"where": fault.where, "what": fault.what})
+                if count <= MAX_FAULTS:
+                    faults.append(fault)
         result: VerificationResult = {
             "entries": report.entries,
             "versions": report.versions,
@@ -148,7 +108,7 @@ class AuditVerifications:
             "faults": faults,
         }
         with self._database.write() as connection:
-            job.finish(connection, cast("dict[str, object]", result))
+            job.finish(connection, result)
 
 
 def _check_head(text: str) -> None:
@@ -157,8 +117,3 @@ def _check_head(text: str) -> None:
     except InvalidParameter as error:
         error.field = "expected_head"
         raise
-
-
-def verification_document(job: JobRow) -> VerificationDocument:
-    """A verification as clients see it."""
-    return document_of(VerificationDocument, job)

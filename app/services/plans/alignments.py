@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from dataclasses import fields
 from datetime import timedelta
 
+from pydantic import TypeAdapter
+
 from app.errors import InvalidParameter
-from app.formats.alignments.read import RegisteredRoad, RoadLanes, RoadStation, write_registered_road
+from app.formats.alignments.read import RegisteredRoad, RoadLanes, write_registered_road
 from app.formats.format import SpooledFile
 from app.geodesy import LocalizationGrade
 from app.planning.alignment import AlignmentDeclaration
@@ -17,6 +19,7 @@ from app.registry.plans import ALIGNMENTS, AlignmentRow, list_for_map
 from app.registry.resources import first_version
 from app.registry.roads import ROADS, RoadRow
 from app.registry.spatial import Box
+from app.roads.lane_line import CalibrationPoint
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
 from app.services.blobs import staged
@@ -30,7 +33,8 @@ BUSY_WAIT_S = 10.0
 """How long a request waits for a decoder process. [s] As imports."""
 MAX_MAP_MARKERS = 50_000
 """Markers around a road that a map is chosen from. Bounds the memory."""
-_DECLARED = frozenset(field.name for field in fields(AlignmentDeclaration))
+_DECLARED = tuple(field.name for field in fields(AlignmentDeclaration))
+_DECLARATION = TypeAdapter(AlignmentDeclaration)
 
 
 class Alignments:
@@ -70,7 +74,7 @@ class Alignments:
         if earlier := find_earlier(self._database, caller.agency_id, key, self._clock()):
             return earlier, True
         road = RoadFile(file, file_name, declaration, name, self._accuracy_m)
-        return self._add(caller, road, {**asdict(declaration), "file_name": file_name}, key)
+        return self._add(caller, road, {}, key)
 
     def add_of_road(
         self, caller: Caller, name: str, road_id: str, lanes: RoadLanes, key: IdempotencyKey | None = None
@@ -94,12 +98,13 @@ class Alignments:
         declaration = AlignmentDeclaration(realization=row.given["realization"], epoch=row.given["epoch"])
         source = {"road_id": road_id, "road_version": row.version, "lanes": lanes.model_dump(mode="json")}
         road = RoadFile(SpooledFile.of(data), "road.json", declaration, name, self._accuracy_m)
-        return self._add(caller, road, {**asdict(declaration), "file_name": road.file_name, **source}, key)
+        return self._add(caller, road, source, key)
 
     def _add(
-        self, caller: Caller, road: RoadFile, declared: dict[str, object], key: IdempotencyKey | None
+        self, caller: Caller, road: RoadFile, source: dict[str, object], key: IdempotencyKey | None
     ) -> tuple[AlignmentDocument, bool]:
         now, agency_id, name = self._clock(), caller.agency_id, road.name
+        declared = {member: getattr(road.declaration, member) for member in _DECLARED}
         with self._database.read() as connection:
             ALIGNMENTS.check_name(connection, agency_id, name)
         read = self._processes.run(summarize_road, road, wait_s=BUSY_WAIT_S)
@@ -117,7 +122,11 @@ class Alignments:
                     "name": name,
                     "source_key": source_key,
                     "source_sha256": road.file.sha256,
-                    "declaration": {member: value for member, value in declared.items() if value is not None},
+                    "declaration": {
+                        **{member: value for member, value in declared.items() if value is not None},
+                        "file_name": road.file_name,
+                        **source,
+                    },
                     "summary": read.summary,
                 }
                 document = answer.store(alignment_document(ALIGNMENTS.add(connection, agency_id, values)))
@@ -191,10 +200,8 @@ class Alignments:
 
 def road_of(row: AlignmentRow, file: SpooledFile, accuracy_m: float) -> RoadFile:
     """The road of a stored alignment."""
-    declared = {name: value for name, value in row.declaration.items() if name in _DECLARED}
-    if declared.get("origin") is not None:
-        declared["origin"] = tuple(declared["origin"])
-    return RoadFile(file, row.declaration.get("file_name", ""), AlignmentDeclaration(**declared), row.name, accuracy_m)
+    declared = _DECLARATION.validate_python({k: value for k, value in row.declaration.items() if k in _DECLARED})
+    return RoadFile(file, row.declaration.get("file_name", ""), declared, row.name, accuracy_m)
 
 
 def alignment_document(row: AlignmentRow) -> AlignmentDocument:
@@ -215,6 +222,6 @@ def _registered_road(row: RoadRow, lanes: RoadLanes) -> RegisteredRoad:
         note=row.transform_note,
         accuracy_m=row.given.get("transform_accuracy_m"),
         lanes=lanes,
-        calibration=[RoadStation(**point) for point in row.calibration],
+        calibration=[CalibrationPoint(**point) for point in row.calibration],
         parts=[[(point[0], point[1]) for point in part] for part in row.parts],
     )

@@ -10,8 +10,7 @@ from app.markers.reading import Verdict
 from app.planning.plan import Plan, PlanFinding, SurveyedPlace, plan_as_built, residual_of
 from app.planning.plan_checks import ExistingMarker, check_plan
 from app.registry.plans import BuiltRow
-from app.services.documents import document_of
-from app.services.plans.documents import AsBuiltDocument, BuiltMarker, CheckComparison, FindingDocument
+from app.services.plans.documents import AsBuiltDocument, BuiltMarker, CheckComparison
 
 MAX_LISTED = 1000
 """Markers that the comparison lists; all are counted."""
@@ -71,16 +70,12 @@ def _compare_checks(plan: Plan, built: Plan) -> list[CheckComparison]:
     return [
         CheckComparison(
             name=name,
-            planned=_document(before.get(name)),
-            built=_document(after.get(name)),
+            planned=before.get(name),
+            built=after.get(name),
             verdict_changed=_verdict(before.get(name)) != _verdict(after.get(name)),
         )
         for name in names
     ]
-
-
-def _document(finding: PlanFinding | None) -> FindingDocument | None:
-    return None if finding is None else document_of(FindingDocument, finding)
 
 
 def _verdict(finding: PlanFinding | None) -> Verdict:

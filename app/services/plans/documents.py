@@ -3,124 +3,15 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field
 from typing_extensions import TypedDict
 
-from app.planning.plan import LeftOut
-from app.planning.proof.report import DriveResult, MarkerProof, ReadRate
-from app.planning.radio_checks import RadioCheck, RadioPlan, Recommendation, check_radio, recommend_settings
-from app.radio.reception import RoadReception
-from app.radio.settings import RadioSettings
-from app.services.documents import document_of
-
-# === What the API returns about a radio plan.
-
-
-class RadioFindingDocument(TypedDict):
-    """One check: its figure, the limit, where that comes from, and what follows."""
-
-    name: str
-    verdict: str
-    figure: float
-    relation: Literal[">=", "<="]
-    limit: float
-    unit: str
-    source: str
-    sentence: str
-
-
-class RoadReceptionDocument(TypedDict):
-    """Reception at points along the road; null where no marker is in range."""
-
-    station_m: list[float]
-    markers_in_range: list[int]
-    packet_success_mean: list[float | None]
-    packet_success_min: list[float | None]
-
-
-class RecommendationDocument(TypedDict):
-    """The best lawful settings that were found."""
-
-    sentence: str
-    reaches: Annotated[bool, Field(description="Whether the probability asked for is reached.")]
-    radio: Annotated[RadioSettings | None, Field(description="Null where nothing is lawful.")]
-    receiver_channels: int
-    read_probability: float
-    battery_days: float
-
-
-class RadioCheckDocument(TypedDict):
-    """The result of checking a radio plan."""
-
-    verdict: str
-    time_on_air_s: float
-    range_m: float
-    preview_m: float
-    packet_success: float
-    read_probability: float
-    battery_days: float
-    checks: list[RadioFindingDocument]
-    road: RoadReceptionDocument
-    recommendation: RecommendationDocument | None
-
-
-def radio_check_document(check: RadioCheck, advice: Recommendation | None) -> RadioCheckDocument:
-    """A radio check, with the recommendation if one was asked for."""
-    return {
-        "verdict": str(check.verdict),
-        "time_on_air_s": round(check.time_on_air_s, 6),
-        "range_m": round(check.range_m, 1),
-        "preview_m": round(check.preview_m, 1),
-        "packet_success": round(check.packet_success, 6),
-        "read_probability": round(check.read_probability, 6),
-        "battery_days": round(check.battery_days, 1),
-        "checks": [
-            document_of(RadioFindingDocument, finding, verdict=str(finding.verdict)) for finding in check.checks
-        ],
-        "road": _reception(check.road),
-        "recommendation": None if advice is None else _recommendation(advice),
-    }
-
-
-def _reception(road: RoadReception) -> RoadReceptionDocument:
-    return {
-        "station_m": road.station_m.round(2).tolist(),
-        "markers_in_range": road.in_range.tolist(),
-        "packet_success_mean": road.success_mean.round(5).tolist(),
-        "packet_success_min": road.success_min.round(5).tolist(),
-    }
-
-
-def _recommendation(advice: Recommendation) -> RecommendationDocument:
-    return {
-        "sentence": advice.sentence,
-        "reaches": advice.reaches,
-        "radio": advice.settings,
-        "receiver_channels": advice.receiver_channels,
-        "read_probability": round(advice.read_probability, 6),
-        "battery_days": round(advice.battery_days, 1),
-    }
-
-
-# === Documents of proofs of plans, as clients see them.
-
-
-class ProofTermsDocument(TypedDict):
-    """What was driven, and how."""
-
-    drives: int
-    seed: int
-    conditions: list[str]
-    cameras: list[str] | None
-    speed_share: float
-    lost_share: float
-    clearance_m: float
-    survey_rmse_m: float
-    max_markers_per_drive: int
-    max_sections_per_drive: int
-    weak_below: float
+from app.formats.alignments.geometry import EventKind
+from app.markers.reading import Verdict
+from app.planning.alignment import RoadEvent
+from app.planning.plan import LeftOut, PlanFinding
+from app.planning.proof import ProofTerms, ReadRate
 
 
 class WeakMarker(TypedDict):
@@ -150,7 +41,7 @@ class ProofFigures(TypedDict):
     wrong: int
     weak_markers: list[WeakMarker]
     """The first 100; the report has all."""
-    terms: ProofTermsDocument
+    terms: ProofTerms
 
 
 class ProofSummary(ProofFigures):
@@ -159,33 +50,6 @@ class ProofSummary(ProofFigures):
     job_id: str
     at: datetime
     """When it ended."""
-
-
-class WrongReadingDocument(TypedDict):
-    """Something that was read and is not there."""
-
-    drive: int
-    marker: int
-    """That was being passed; 0 beside line magnets."""
-    text: str
-
-
-class ProofDocument(TypedDict):
-    """The report of a proof."""
-
-    format: str
-    plan: str
-    terms: ProofTermsDocument
-    complete: bool
-    note: str
-    rates: list[ReadRate]
-    drives: list[DriveResult]
-    weak: list[int]
-    wrong: list[WrongReadingDocument]
-    markers: list[MarkerProof]
-
-
-# === Documents of alignments and plans, as clients see them.
 
 
 PlanStatus = Literal["draft", "checked", "proved", "approved", "committed", "built", "surveyed"]
@@ -208,21 +72,12 @@ class LaneSummary(TypedDict):
     right_style: str
 
 
-class EventSummary(TypedDict):
-    """Something on a lane that vehicles must know ahead of time."""
-
-    kind: str
-    lane: str
-    chainage_m: float
-    value: float | str | None
-
-
 class RoadSummary(TypedDict):
     """What was read of a road."""
 
     format: str
     lanes: list[LaneSummary]
-    events: list[EventSummary]
+    events: list[RoadEvent]
     areas: int
     lane_length_m: float
     extent_deg: list[float]
@@ -267,9 +122,13 @@ class LaneProfile(TypedDict):
     lat_deg: list[float]
 
 
-class ProfileEvent(EventSummary):
+class ProfileEvent(TypedDict):
     """An event with its position."""
 
+    kind: EventKind
+    lane: str
+    chainage_m: float
+    value: float | str | None
     lon_deg: float
     lat_deg: float
 
@@ -295,31 +154,14 @@ class AlignmentPage(TypedDict):
     items: list[AlignmentDocument]
 
 
-class FindingDocument(TypedDict):
-    """One check of a plan, at its worst place."""
-
-    name: str
-    figure: float
-    relation: str
-    limit: float
-    unit: str
-    source: str
-    verdict: str
-    sentence: str
-    lane: str | None
-    station_m: float | None
-    lon_deg: float | None
-    lat_deg: float | None
-
-
 class PlanSummary(TypedDict):
     """What was placed, and what the checks found."""
 
     counts: dict[str, int]
     lane_length_m: float
-    verdict: str
+    verdict: Verdict
     """The worst of all findings."""
-    findings: list[FindingDocument]
+    findings: list[PlanFinding]
     left_out: list[LeftOut]
     left_out_count: int
     cost: float
@@ -336,7 +178,7 @@ class CheckFigure(TypedDict):
     relation: str
     limit: float
     unit: str
-    verdict: str
+    verdict: Verdict
 
 
 class PreviewedMarker(TypedDict):
@@ -375,7 +217,7 @@ class PlanOverview(TypedDict):
     counts: dict[str, int]
     lane_length_m: float
     left_out_count: int
-    verdict: str
+    verdict: Verdict
     checks: list[CheckFigure]
     """Each at its worst place."""
     cost: float
@@ -401,6 +243,34 @@ class PlanDocument(PlanSummary):
     version: int
     created_at: datetime
     updated_at: datetime
+
+
+class MadePlanResult(TypedDict):
+    """A plan that a job has made."""
+
+    plan_version: int
+
+
+class ProofResult(TypedDict):
+    """A proof in short; the report is a resource of the plan."""
+
+    plan_version: int
+    """Version of the plan that was proved."""
+    outdated: bool
+    """The plan was changed while it was proved: the result is not its proof."""
+    passed: bool
+    weak: int
+    wrong: int
+
+
+class PackageResult(TypedDict):
+    """A package in short."""
+
+    plan_version: int
+    """Version of the plan that was packed."""
+    size_bytes: int
+    sha256: str
+    files: int
 
 
 class PlanPage(TypedDict):
@@ -453,9 +323,9 @@ class CheckComparison(TypedDict):
     """A check of a plan beside the same check of what was built."""
 
     name: str
-    planned: FindingDocument | None
+    planned: PlanFinding | None
     """As the plan was approved; null if the check did not apply then."""
-    built: FindingDocument | None
+    built: PlanFinding | None
     """With surveyed positions in place of planned ones, and the other markers that are in the registry by now."""
     verdict_changed: bool
 
@@ -473,18 +343,3 @@ class AsBuiltDocument(TypedDict):
     """Those out of tolerance first, then by the size of their residuals; at most 1,000."""
     checks: list[CheckComparison]
     """Empty before the first marker is surveyed."""
-
-
-# === Use case on radio plans: check one, and recommend settings. Nothing is stored.
-
-
-def check_plan(plan: RadioPlan, *, recommend: bool) -> RadioCheckDocument:
-    """The result of checking a radio plan, with recommended settings if asked for.
-
-    Raises
-    ------
-    InvalidParameter
-        More markers are in range of one receiver than a check allows.
-    """
-    advice = recommend_settings(plan) if recommend else None
-    return radio_check_document(check_radio(plan), advice)

@@ -22,9 +22,10 @@ from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.documents import PlanPreview, PreviewedMarker
 from app.services.plans.plans import Plans
-from app.services.plans.proofs import PlanJobDocument, caller_of, plan_job_document
+from app.services.plans.proofs import caller_of
 from app.services.plans.tasks import MadePlan
 from app.services.ports import Clock, JobQueue
+from app.services.progress import JobDocument, job_document
 
 IMMEDIATE_LANES_M = 20_000.0
 """Plans of roads with lanes up to this length are made while the caller waits, longer ones by jobs. [m] Some seconds
@@ -61,7 +62,7 @@ class PlanMaking:
 
     def request(
         self, caller: Caller, name: str, alignment_id: str, rules: dict[str, object], key: IdempotencyKey | None = None
-    ) -> tuple[PlanJobDocument, bool]:
+    ) -> tuple[JobDocument, bool]:
         """Queue the making of a plan; returns the job and whether the request had been made before.
 
         Raises
@@ -83,7 +84,7 @@ class PlanMaking:
             ALIGNMENTS.get(connection, agency_id, alignment_id)
             PLANS.check_name(connection, agency_id, name)
             store.add_job(connection, job)
-            document = answer.store(plan_job_document(job))
+            document = answer.store(job_document(job, now))
         self._queue.submit(job.id, job.agency_id, JobKind.PLAN)
         return document, False
 

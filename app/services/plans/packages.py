@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from app.encoders.packer import Packer
-from app.encoders.plate import ArtworkFormat, ArtworkOptions
 from app.errors import NotFound
-from app.planning.outputs.drawing_sheet import TitleBlock
-from app.planning.outputs.package import MANIFEST, OutputOptions, PackageOptions
-from app.planning.outputs.strip_map import DrawingOptions
-from app.plots.track import draw_trade_off
+from app.planning.outputs.package import MANIFEST, PackageOptions
 from app.registry import jobs as store
 from app.registry.column_types import new_id
 from app.registry.database import Database
@@ -29,11 +26,13 @@ from app.services.blobs import delete_unused, staged
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S
-from app.services.plans.proofs import WAIT_S, PlanJobDocument, check_only_one, plan_job_document, results_in_order
+from app.services.plans.proofs import WAIT_S, check_only_one, results_in_order
 from app.services.plans.tasks import check_package, list_package_parts, write_package_manifest, write_package_part
 from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue
+from app.services.progress import JobDocument, job_document
 
 _FOLDER = "packages"
+_OPTIONS = TypeAdapter(PackageOptions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +63,9 @@ class Packages:
         self._in_flight, self._ttl = in_flight, idempotency_ttl
 
     def request(
-        self, caller: Caller, plan_id: str, options: Mapping[str, object], key: IdempotencyKey | None = None
-    ) -> tuple[PlanJobDocument, bool]:
+        self, caller: Caller, plan_id: str, options: PackageOptions, key: IdempotencyKey | None = None
+    ) -> tuple[JobDocument, bool]:
         """Queue the package of a plan as it is; returns the job and whether the request had been made before.
-
-        Parameters
-        ----------
-        options : mapping
-            See `package_options`.
 
         Raises
         ------
@@ -87,11 +81,11 @@ class Packages:
         with self._database.read() as connection:
             row = PLANS.get(connection, agency_id, plan_id)
         document = self._blobs.get(row.document_key)
-        self._processes.run(check_package, document, package_options(options), wait_s=BUSY_WAIT_S)
+        self._processes.run(check_package, document, options, wait_s=BUSY_WAIT_S)
         job_input = {
             "document_key": row.document_key,
             "plan_version": row.version,
-            "options": dict(options),
+            "options": asdict(options),
             "label": caller.label,
         }
         job = new_job(
@@ -102,7 +96,7 @@ class Packages:
                 return answer.response, True
             check_only_one(connection, agency_id, JobKind.PACKAGE, plan_id)
             store.add_job(connection, job)
-            response = answer.store(plan_job_document(job))
+            response = answer.store(job_document(job, now))
         self._queue.submit(job.id, job.agency_id, JobKind.PACKAGE)
         return response, False
 
@@ -136,7 +130,8 @@ class Packages:
 
     def _write(self, job: RunningJob, path: Path) -> int:
         """Write the ZIP part by part; returns the number of its files."""
-        document, options = self._blobs.get(job.row.input["document_key"]), package_options(job.row.input["options"])
+        document = self._blobs.get(job.row.input["document_key"])
+        options = _OPTIONS.validate_python(job.row.input["options"])
         parts = self._processes.run(list_package_parts, document, options, wait_s=WAIT_S)
         arguments = ((document, options, part) for part in parts)
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -171,21 +166,3 @@ class Packages:
             stage.keep()
         if before is not None and before.result is not None:
             delete_unused(self._blobs, [before.result["blob_key"]])
-
-
-def package_options(given: Mapping[str, Any]) -> PackageOptions:
-    """Options from the members of a request.
-
-    Parameters
-    ----------
-    given : mapping
-        ``crs``, ``unit``, ``scale``, ``title_block`` with the members of `TitleBlock`, ``formats``, ``heaters``,
-        ``leds``; all optional.
-    """
-    drawings = DrawingOptions(TitleBlock(**(given.get("title_block") or {})), given.get("scale"))
-    formats = given.get("formats") or (ArtworkFormat.PDF, ArtworkFormat.SVG)
-    return PackageOptions(
-        OutputOptions(given.get("crs"), given.get("unit"), drawings, draw_trade_off),
-        tuple(dict.fromkeys(ArtworkFormat(form) for form in formats)),
-        ArtworkOptions(heaters=given.get("heaters", False), leds=given.get("leds", False)),
-    )

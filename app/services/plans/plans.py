@@ -15,6 +15,7 @@ from app.errors import CodeTaken, Conflict, InvalidParameter
 from app.families import FAMILIES
 from app.families.family import Family
 from app.families.surveys import PLANNED, Commitment, MarkerRules, PlannedRow
+from app.formats.surveys.declaration import Unit
 from app.markers.magnet_design import Codebook
 from app.planning.outputs.plan_document import read_plan
 from app.planning.plan import Plan, PlannedMarker, PlannedTag
@@ -298,7 +299,7 @@ class Plans:
         return document, False
 
     def file(
-        self, caller: Caller, plan_id: str, name: str, *, crs: str | None = None, unit: str | None = None
+        self, caller: Caller, plan_id: str, name: str, *, crs: str | None = None, unit: Unit | None = None
     ) -> tuple[bytes, int]:
         """A file of a plan, and the plan's version; CRS and unit are those of the crew that stakes it out.
 

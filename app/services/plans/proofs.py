@@ -10,30 +10,29 @@ from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from contextvars import copy_context
-from datetime import datetime, timedelta
+from datetime import timedelta
 from functools import partial
-from typing import Annotated, Any, Literal, NotRequired, TypeVar, TypeVarTuple, cast
+from typing import Any, TypeVar, TypeVarTuple, cast
 
 import sqlalchemy as sa
-from pydantic import Field
-from typing_extensions import TypedDict
 
 from app.errors import Conflict, NotFound, Unavailable
 from app.planning.proof import ProofTerms, UnitResult
 from app.registry import jobs as store
 from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState, new_job
+from app.registry.jobs import UNFINISHED, JobKind, new_job
 from app.registry.plans import PLANS, PlanRow, add_unit, delete_units, list_units
 from app.services.access.access import Caller, Scope
 from app.services.access.audit import log_change
 from app.services.blobs import delete_unused, staged
-from app.services.documents import ErrorDocument, document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S
+from app.services.plans.documents import ProofResult
 from app.services.plans.tasks import WrittenProof, check_proof, list_proof_units, prove_unit, write_proof
 from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue, Pending
+from app.services.progress import JobDocument, job_document
 
 # === Many tasks of one job in the decoder processes, a limited number of them at the same time.
 
@@ -137,110 +136,7 @@ class _Feeder:
 DRAFT, CHECKED, PROVED, APPROVED, COMMITTED = "draft", "checked", "proved", "approved", "committed"
 
 
-# === Jobs about plans: making one of a long road, proving one, packing its files. Listed, read and cancelled alike.
-
-
-KINDS = (JobKind.PLAN, JobKind.PROOF, JobKind.PACKAGE)
-PlanJobKind = Literal["plan", "proof", "package"]
-
-
-class PlanJobLinks(TypedDict):
-    """Where to read the job again, and the plan."""
-
-    self: str
-    plan: NotRequired[str]
-
-
-class PlanJobResult(TypedDict):
-    """What a job has done. Members that do not belong to its kind are left out."""
-
-    plan_version: NotRequired[int]
-    """Version of the plan that was proved, packed or made."""
-    outdated: NotRequired[bool]
-    """The plan was changed while it was proved: the result is not its proof."""
-    passed: NotRequired[bool]
-    weak: NotRequired[int]
-    wrong: NotRequired[int]
-    size_bytes: NotRequired[int]
-    sha256: NotRequired[str]
-    files: NotRequired[int]
-
-
-class PlanJobSummary(TypedDict):
-    """A job about a plan, without its result."""
-
-    id: str
-    kind: PlanJobKind
-    plan_id: Annotated[str | None, Field(description="Null before the plan is made.")]
-    state: JobState
-    progress: Annotated[float, Field(description="0 to 1.")]
-    steps_done: Annotated[int | None, Field(description="Units of a proof, files of a package; null if unknown.")]
-    steps_total: int | None
-    attempts: Annotated[int, Field(description="Since the last part of the result was stored.")]
-    cancel_requested: Annotated[bool, Field(description="A running job stops at its next step.")]
-    created_at: datetime
-    finished_at: datetime | None
-    error: Annotated[ErrorDocument | None, Field(description="Why there is no result.")]
-    links: PlanJobLinks
-
-
-class PlanJobDocument(PlanJobSummary):
-    """A job about a plan."""
-
-    result: PlanJobResult | None
-
-
-class PlanJobPage(TypedDict):
-    """A page of jobs, newest first; the Link header leads to the next one."""
-
-    items: list[PlanJobSummary]
-
-
-class PlanJobs:
-    """Use cases on jobs about plans."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-
-    def get(self, caller: Caller, job_id: str) -> PlanJobDocument:
-        """A job with its progress, and its result once there is one.
-
-        Raises
-        ------
-        NotFound
-            There is none with this id, or it belongs to another agency.
-        """
-        with self._database.read() as connection:
-            return plan_job_document(store.get_job(connection, caller.agency_id, KINDS, job_id))
-
-    def page(
-        self, caller: Caller, *, plan_id: str | None = None, state: str | None = None, before: str | None = None,
-        limit: int = 100,
-    ) -> tuple[PlanJobPage, str | None]:  # fmt: skip
-        """A page of jobs without their results, newest first, and the id to continue before."""
-        with self._database.read() as connection:
-            rows = store.list_jobs(
-                connection, caller.agency_id, KINDS, state=state, before=before, limit=limit + 1, subject_id=plan_id
-            )
-        page = PlanJobPage(items=[plan_job_summary(row) for row in rows[:limit]])
-        return page, rows[limit - 1].id if len(rows) > limit else None
-
-
-def plan_job_document(job: JobRow) -> PlanJobDocument:
-    """A job as clients see it."""
-    result = None
-    if job.result is not None:
-        members = PlanJobResult.__annotations__
-        result = cast("PlanJobResult", {name: value for name, value in job.result.items() if name in members})
-    return {**plan_job_summary(job), "result": result}
-
-
-def plan_job_summary(job: JobRow) -> PlanJobSummary:
-    """A job without its result."""
-    links = PlanJobLinks(self=f"/v1/plan-jobs/{job.id}")
-    if job.subject_id is not None:
-        links["plan"] = f"/v1/plans/{job.subject_id}"
-    return document_of(PlanJobSummary, job, plan_id=job.subject_id, links=links)
+# === Jobs about plans: making one of a long road, proving one, packing its files.
 
 
 def check_only_one(connection: sa.Connection, agency_id: str, kind: JobKind, plan_id: str) -> None:
@@ -293,12 +189,12 @@ class Proofs:
 
     def request(
         self, caller: Caller, plan_id: str, terms: ProofTerms, version: int | None, key: IdempotencyKey | None = None
-    ) -> tuple[PlanJobDocument, bool]:
+    ) -> tuple[JobDocument, bool]:
         """Queue the proof of a plan as it is.
 
         Returns
         -------
-        job : PlanJobDocument
+        job : JobDocument
         replayed : bool
             The request had been made before under the same Idempotency-Key.
 
@@ -332,7 +228,7 @@ class Proofs:
             check_only_one(connection, agency_id, JobKind.PROOF, plan_id)
             delete_units(connection, agency_id)
             store.add_job(connection, job)
-            document = answer.store(plan_job_document(job))
+            document = answer.store(job_document(job, now))
         self._queue.submit(job.id, job.agency_id, JobKind.PROOF)
         return document, False
 
@@ -391,11 +287,13 @@ class Proofs:
             with self._database.write() as connection:
                 row = PLANS.get(connection, agency_id, plan_id)
                 outdated = row.document_key != job.row.input["document_key"]
-                result = {
-                    "plan_version": job.row.input["plan_version"],
-                    "outdated": outdated,
-                    **{name: figures[name] for name in ("passed", "weak", "wrong")},
-                }
+                result = ProofResult(
+                    plan_version=job.row.input["plan_version"],
+                    outdated=outdated,
+                    passed=figures["passed"],
+                    weak=figures["weak"],
+                    wrong=figures["wrong"],
+                )
                 if not job.finish(connection, result):
                     return
                 delete_units(connection, agency_id)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +17,11 @@ from app.families import get_family
 from app.formats.alignments.geometry import AlignmentFile
 from app.formats.alignments.read import read_alignment
 from app.formats.format import SpooledFile
+from app.formats.surveys.declaration import Unit
 from app.geodesy.systems import is_ellipsoidal
 from app.markers.magnet_design import Codebook
 from app.markers.plate import PlateGeometry
-from app.markers.reading import PlateReading, Verdict
+from app.markers.reading import PlateReading, worst_verdict
 from app.planning.alignment import Alignment, AlignmentDeclaration, Floats, Lane, RoadEvent
 from app.planning.outputs.bill import plan_bill
 from app.planning.outputs.hd_lanelet2 import write_lanelet2
@@ -29,10 +30,10 @@ from app.planning.outputs.hd_opendrive import write_opendrive
 from app.planning.outputs.package import OutputOptions, Package, PackageOptions, PackagePart, write_plan_file
 from app.planning.outputs.plan_document import lane_points_deg, read_plan, write_plan
 from app.planning.placement.place import unused_numbers
-from app.planning.plan import Plan, PlanFinding, PlannedCerpm, PlannedLineMagnet, PlannedMarker
+from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker
 from app.planning.plan_checks import ExistingMarker
 from app.planning.proof import ProofReport, ProofTerms, ProofUnit, UnitResult, summarize
-from app.planning.proof.report import markers_csv, report_document
+from app.planning.proof.report import markers_csv
 from app.planning.rules import RoadRules, check_rules
 from app.plots.track import draw_trade_off
 from app.registry.bulk_load import Columns
@@ -45,14 +46,11 @@ from app.services.plans.as_built import compare_as_built
 from app.services.plans.documents import (
     AlignmentProfile,
     AsBuiltDocument,
-    EventSummary,
-    FindingDocument,
     LaneProfile,
     LaneSummary,
     PlanSummary,
     ProfileEvent,
     ProofFigures,
-    ProofTermsDocument,
     RoadSummary,
     WeakMarker,
 )
@@ -75,7 +73,7 @@ def road_summary(road: Alignment, format_name: str = "") -> RoadSummary:
     return {
         "format": format_name,
         "lanes": [_lane_summary(lane) for lane in road.lanes],
-        "events": [document_of(EventSummary, event) for event in road.events[:MAX_LISTED]],
+        "events": list(road.events[:MAX_LISTED]),
         "areas": len(road.areas),
         "lane_length_m": road.lane_length_m,
         "extent_deg": extent_deg(road),
@@ -87,14 +85,14 @@ def road_summary(road: Alignment, format_name: str = "") -> RoadSummary:
     }
 
 
-def plan_summary(plan: Plan) -> dict[str, object]:
-    """What a plan has, as `PlanSummary`."""
+def plan_summary(plan: Plan) -> PlanSummary:
+    """What a plan has."""
     bill = plan_bill(plan)
-    summary: PlanSummary = {
+    return {
         "counts": plan.counts,
         "lane_length_m": plan.alignment.lane_length_m,
         "verdict": worst_verdict(plan.findings),
-        "findings": [document_of(FindingDocument, finding) for finding in plan.findings],
+        "findings": list(plan.findings),
         "left_out": list(plan.left_out[:MAX_LISTED]),
         "left_out_count": len(plan.left_out),
         "cost": bill.total,
@@ -102,28 +100,20 @@ def plan_summary(plan: Plan) -> dict[str, object]:
         "currency": bill.currency,
         "codebook_entries": len(plan.codebook.entries) if plan.codebook is not None else 0,
     }
-    return dict(summary)
 
 
-def proof_figures(report: ProofReport, results: Sequence[UnitResult]) -> dict[str, object]:
-    """What the plan's document shows of a proof, as `ProofFigures`."""
-    figures: ProofFigures = {
+def proof_figures(report: ProofReport, results: Sequence[UnitResult]) -> ProofFigures:
+    """What the plan's document shows of a proof."""
+    return {
         "passed": not report.wrong,
         "units": len(results),
         "rates": list(report.rates),
         "markers": len(report.markers),
         "weak": len(report.weak),
         "wrong": len(report.wrong),
-        "weak_markers": [document_of(WeakMarker, marker) for marker in report.weak[:MAX_WEAK]],
-        "terms": cast("ProofTermsDocument", report.terms.model_dump(mode="json")),
+        "weak_markers": [document_of(WeakMarker, marker) for marker in report.list_weak()[:MAX_WEAK]],
+        "terms": cast("ProofTerms", report.terms.model_dump(mode="json")),  # as it is stored
     }
-    return dict(figures)
-
-
-def worst_verdict(findings: tuple[PlanFinding, ...]) -> str:
-    """The worst verdict of all findings."""
-    found = {finding.verdict for finding in findings}
-    return str(next((verdict for verdict in (Verdict.FAIL, Verdict.WARN) if verdict in found), Verdict.OK))
 
 
 def extent_deg(road: Alignment) -> list[float]:
@@ -200,7 +190,7 @@ def _greatest_near(values: Floats, at: np.ndarray[tuple[int], np.dtype[np.int_]]
 def _event(lane: Lane, event: RoadEvent) -> ProfileEvent:
     lon, lat = lane.position_at(event.chainage_m)
     return {
-        "kind": event.kind.value,
+        "kind": event.kind,
         "lane": event.lane,
         "chainage_m": event.chainage_m,
         "value": event.value,
@@ -210,8 +200,7 @@ def _event(lane: Lane, event: RoadEvent) -> ProfileEvent:
 
 
 def _rounded(values: Floats, digits: int) -> list[float]:
-    found: list[float] = np.round(values, digits).tolist()
-    return found
+    return cast("list[float]", np.round(values, digits).tolist())
 
 
 # === What GIS clients read of alignments and plans, made where these are computed.
@@ -321,7 +310,7 @@ class RoadFile:
 class SummarizedRoad:
     """A road that was read: its document, and its lanes for GIS clients."""
 
-    summary: dict[str, object]
+    summary: RoadSummary
     lanes: list[LaneFeature]
 
 
@@ -330,7 +319,7 @@ def summarize_road(road: RoadFile) -> SummarizedRoad:
     """Read a road: its lanes, events, warnings and extent."""
     file = read_alignment(road.file.read(), road.file_name)
     alignment = _build(file, road, None)
-    return SummarizedRoad(dict(road_summary(alignment, file.format)), lane_features(alignment))
+    return SummarizedRoad(road_summary(alignment, file.format), lane_features(alignment))
 
 
 @decoder_task(*_ROAD)
@@ -365,7 +354,7 @@ class MadePlan:
     """A plan that was placed and checked."""
 
     document: bytes  # as `app.planning.outputs.plan_document.write_plan` writes it, compressed by zlib
-    summary: dict[str, object]  # what lists and the plan's page show
+    summary: PlanSummary  # what lists and the plan's page show
     numbers: tuple[tuple[str, str], ...]  # (family, code), which no other marker may have
     features: Columns  # the markers for GIS clients
 
@@ -402,10 +391,9 @@ def make_plan(
 
 
 @decoder_task(*_PLAN)
-def write_file_of_plan(document: bytes, name: str, crs: str | None = None, unit: str | None = None) -> bytes:
+def write_file_of_plan(document: bytes, name: str, crs: str | None = None, unit: Unit | None = None) -> bytes:
     """Write a file of a plan; CRS and unit are those of the stakeout."""
-    options = OutputOptions(crs, unit, draw_trade_off=draw_trade_off)
-    return write_plan_file(_plan(document), name, options)
+    return write_plan_file(_plan(document), name, OutputOptions(crs, unit), draw_trade_off)
 
 
 @decoder_task(*_PLAN)
@@ -457,7 +445,7 @@ def read_face(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> Sequence
 @lru_cache(maxsize=1)
 def _package(document: bytes, options: PackageOptions) -> Package:
     """A plan with what its parts share: one a process, kept until another plan is packed."""
-    return Package(_plan(document), options)
+    return Package(_plan(document), options, draw_trade_off)
 
 
 # === Proofs of plans.
@@ -467,9 +455,9 @@ def _package(document: bytes, options: PackageOptions) -> Package:
 class WrittenProof:
     """A finished proof."""
 
-    report: bytes  # JSON of `app.planning.proof.report.report_document`, compressed by zlib
+    report: bytes  # JSON of the `ProofReport`, compressed by zlib
     table: bytes  # CSV with the markers that were driven over, compressed by zlib
-    summary: dict[str, Any]  # what the plan's document shows, as `ProofFigures`
+    summary: ProofFigures  # what the plan's document shows
 
 
 @decoder_task(*_PLAN)
@@ -496,8 +484,7 @@ def prove_unit(document: bytes, terms: ProofTerms, unit: ProofUnit) -> UnitResul
 def write_proof(document: bytes, terms: ProofTerms, results: list[UnitResult]) -> WrittenProof:
     """Write the report of a proof from the results of all its units."""
     report = summarize(_prover(document, terms).plan, terms, results)
-    text = orjson.dumps(report_document(report), option=orjson.OPT_SERIALIZE_NUMPY)
-    table = markers_csv(report).encode()
+    text, table = report.write(), markers_csv(report).encode()
     return WrittenProof(zlib.compress(text, 6), zlib.compress(table, 6), proof_figures(report, results))
 
 

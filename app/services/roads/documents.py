@@ -7,16 +7,19 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 from itertools import chain
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import orjson
 import sqlalchemy as sa
+from pydantic import BaseModel, ConfigDict, FailFast, Field, JsonValue
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
+from app.families.documents import Metres
 from app.geodesy import PlacedPositions, place_positions
+from app.inputs import Number, StrictModel, Text
 from app.registry.roads import ROADS, RoadRow, RoadSummaryRow, StoredStation
 from app.roads.axis import Axis, Foot
 from app.roads.lane_line import CalibrationPoint, Measures, calibrate
@@ -29,31 +32,106 @@ _REACH_M = 50.0
 _AMBIGUOUS_M = 1.0
 _ROUNDING_M = 0.001  # of chainages that a form shows
 
-Point = tuple[float, float]
+MAX_CALIBRATION = 5_000
+Reason = Annotated[Text, Field(min_length=1, max_length=500, description="Why; goes into the history.")]
+Count = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+# long lists stop at their first error: a body of 1 MiB has room for 200,000 of them
+_Line = Annotated[
+    list[Annotated[list[Number], Field(min_length=2, max_length=4), FailFast()]], Field(min_length=2), FailFast()
+]
 
 
-@dataclass(frozen=True, slots=True)
-class LinesInput:
-    """The axis of a road as it was sent."""
-
-    parts: tuple[tuple[Point, ...], ...]  # longitude and latitude [deg], or easting and northing in the unit of the CRS
-    # `crs`, `realization`, `epoch`: as of a marker's position; WGS 84 without
-    crs: str | None = None
-    realization: str | None = None
-    epoch: float | None = None
-    several: bool = False  # it came as a MultiLineString
+class _Geometry(BaseModel):
+    model_config = ConfigDict(extra="ignore")  # RFC 7946, section 6.1: foreign members
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrationInput:
-    """A place with a known measure: a vertex of a part, a position beside the axis in the road's CRS, or a chainage."""
+class GeoLineIn(_Geometry):
+    """A line."""
 
-    measure_m: float
-    ahead_m: float | None = None
-    part: int = 0
-    vertex: int | None = None
-    position: Point | None = None
-    chainage_m: float | None = None
+    type: Literal["LineString"]
+    coordinates: _Line
+
+    @property
+    def lines(self) -> list[list[list[float]]]:
+        """The line alone."""
+        return [self.coordinates]
+
+
+class MultiLineStringIn(_Geometry):
+    """Several lines."""
+
+    type: Literal["MultiLineString"]
+    coordinates: Annotated[list[_Line], Field(min_length=1), FailFast()]
+
+    @property
+    def lines(self) -> list[list[list[float]]]:
+        """All lines."""
+        return self.coordinates
+
+
+AnyLine = Annotated[GeoLineIn | MultiLineStringIn, Field(discriminator="type")]
+"""Lines of longitude and latitude [deg], or of easting and northing in the unit of the CRS; heights are left out."""
+
+
+class StationIn(StrictModel):
+    """A calibration point: a place with a known measure. The place is a vertex, a position or a chainage."""
+
+    measure_m: Metres = Field(description="Measure there, coming from before. [m]")
+    ahead_m: Metres | None = Field(None, description="At an equation of stationing: the measure going on. [m]")
+    part: Count = Field(0, description="Line of a MultiLineString, from 0; with `vertex` or `chainage_m`.")
+    vertex: Count | None = Field(None, description="Vertex of the line, from 0.")
+    position: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="Instead of a vertex: a position within 50 m of the axis, in the road's CRS."
+    )
+    chainage_m: Metres | None = Field(
+        None, description="Instead of a vertex: distance along the axis from the start of its first line. [m]"
+    )
+
+
+class AxisIn(StrictModel):
+    """Reference system of an axis and of its calibration, and what is done with it."""
+
+    crs: Text | None = Field(None, max_length=100, description="EPSG code or URN of the geometry; WGS 84 if left out.")
+    realization: Text | None = Field(None, min_length=1, max_length=64)
+    epoch: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1900, le=2200)] | None = None
+    measure_markers: Annotated[bool, Field(strict=True)] = Field(
+        True, description="Give the markers that name the road the measure and offset of their position."
+    )
+    dry_run: Annotated[bool, Field(strict=True)] = Field(False, description="Say what would happen; store nothing.")
+    reason: Reason | None = None
+
+
+ROAD_EXAMPLE: dict[str, JsonValue] = {
+    "name": "A 5 northbound",
+    "crs": "EPSG:25832",
+    "geometry": {"type": "LineString", "coordinates": [[456000, 5427000], [456060, 5427210], [456150, 5427400]]},
+    "calibration": [{"measure_m": 612000, "vertex": 0}, {"measure_m": 612430, "vertex": 2}],
+}
+
+
+class RoadIn(AxisIn):
+    """A road to register."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [ROAD_EXAMPLE]})
+
+    name: Text = Field(min_length=1, max_length=200, description="As the markers on it say in `road`.")
+    geometry: AnyLine = Field(description="The axis in the direction of rising measures; heights are left out.")
+    calibration: Annotated[list[StationIn], Field(max_length=MAX_CALIBRATION)] = Field(
+        default_factory=list, description="Known measures; without, true metres from 0."
+    )
+
+
+class RoadPatch(AxisIn):
+    """Members to change; one that is left out stays. A new geometry comes with its calibration."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"calibration": [{"measure_m": 612000, "vertex": 0}], "reason": "new kilometre posts"}]
+        },
+    )
+
+    geometry: AnyLine | None = None
+    calibration: Annotated[list[StationIn], Field(max_length=MAX_CALIBRATION)] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +147,7 @@ class PlacedLines:
     note: str | None
 
 
-def place_lines(lines: LinesInput, accuracy_m: float) -> PlacedLines:
+def place_lines(geometry: AnyLine, axis: AxisIn, accuracy_m: float) -> PlacedLines:
     """Bring lines to WGS 84 / ITRF.
 
     Raises
@@ -77,17 +155,17 @@ def place_lines(lines: LinesInput, accuracy_m: float) -> PlacedLines:
     InvalidParameter, ReferenceSystemError
         The CRS is unknown, or a vertex is out of its range.
     """
-    flat = np.array([point for part in lines.parts for point in part], dtype=np.float64)
-    placed = _placed(flat, lines, accuracy_m, ["geometry.coordinates"] * len(flat))
+    flat = np.array([point[:2] for line in geometry.lines for point in line], dtype=np.float64)
+    placed = _placed(flat, axis, accuracy_m, ["geometry.coordinates"] * len(flat))
     points = np.stack([placed.lon_deg, placed.lat_deg], axis=1).tolist()
-    ends = np.cumsum([len(part) for part in lines.parts]).tolist()
+    ends = np.cumsum([len(line) for line in geometry.lines]).tolist()
     parts = [points[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
     accuracy, grade = placed.transform_accuracy_m, str(placed.grade)
     return PlacedLines(parts, placed.crs, placed.realization, placed.epoch, accuracy, grade, placed.note)
 
 
 def resolve_calibration(
-    axis: Axis, lines: LinesInput, points: Sequence[CalibrationInput], accuracy_m: float
+    axis: Axis, given: AxisIn, points: Sequence[StationIn], accuracy_m: float
 ) -> list[CalibrationPoint]:
     """Calibration points on the axis, in its order.
 
@@ -96,24 +174,22 @@ def resolve_calibration(
     InvalidParameter
         A vertex or a part that is not there, or a position that is too far from the axis or beside it twice.
     """
-    feet = _feet(axis, lines, points, accuracy_m)
+    feet = _feet(axis, given, points, accuracy_m)
     settled = [_settled(axis, point, feet.get(k, []), f"calibration.{k}") for k, point in enumerate(points)]
     return sorted(settled, key=lambda point: (point.part, point.chainage_m))
 
 
-def _feet(
-    axis: Axis, lines: LinesInput, points: Sequence[CalibrationInput], accuracy_m: float
-) -> dict[int, list[Foot]]:
+def _feet(axis: Axis, given: AxisIn, points: Sequence[StationIn], accuracy_m: float) -> dict[int, list[Foot]]:
     """Feet of the calibration points that are positions, by the number of the point."""
     positions = {k: point.position for k, point in enumerate(points) if point.position is not None}
     if not positions:
         return {}
     fields = [f"calibration.{k}.position" for k in positions]
-    placed = _placed(np.array(list(positions.values()), dtype=np.float64), lines, accuracy_m, fields)
+    placed = _placed(np.array(list(positions.values()), dtype=np.float64), given, accuracy_m, fields)
     return dict(zip(positions, axis.locate(placed.lon_deg, placed.lat_deg, _REACH_M), strict=True))
 
 
-def _settled(axis: Axis, point: CalibrationInput, feet: list[Foot], field: str) -> CalibrationPoint:
+def _settled(axis: Axis, point: StationIn, feet: list[Foot], field: str) -> CalibrationPoint:
     if [point.vertex, point.position, point.chainage_m].count(None) != 2:
         raise InvalidParameter(
             "a calibration point is a vertex, a position or a chainage",
@@ -151,7 +227,7 @@ def _settled(axis: Axis, point: CalibrationInput, feet: list[Foot], field: str) 
     return CalibrationPoint(feet[0].part, feet[0].chainage_m, point.measure_m, point.ahead_m)
 
 
-def _at_chainage(axis: Axis, point: CalibrationInput, chainage_m: float, field: str) -> CalibrationPoint:
+def _at_chainage(axis: Axis, point: StationIn, chainage_m: float, field: str) -> CalibrationPoint:
     """The place at a chainage, in the part that was named: where parts touch, both have the chainage."""
     ranges_m = axis.part_ranges_m
     for start_m, end_m in ranges_m[point.part : point.part + 1]:
@@ -167,16 +243,16 @@ def _at_chainage(axis: Axis, point: CalibrationInput, chainage_m: float, field: 
 
 
 def _placed(
-    points: npt.NDArray[np.float64], lines: LinesInput, accuracy_m: float, fields: Sequence[str]
+    points: npt.NDArray[np.float64], given: AxisIn, accuracy_m: float, fields: Sequence[str]
 ) -> PlacedPositions:
     try:
         placed = place_positions(
             points[:, 0],
             points[:, 1],
             np.full(len(points), np.nan),
-            crs=lines.crs,
-            realization=lines.realization,
-            epoch=lines.epoch,
+            crs=given.crs,
+            realization=given.realization,
+            epoch=given.epoch,
             accuracy_m=accuracy_m,
         )
     except InvalidParameter as error:
@@ -229,7 +305,7 @@ def route_of(row: RoadRow) -> Route:
 @lru_cache(maxsize=64)
 def _route(content: bytes) -> Route:
     parts, points = orjson.loads(content)
-    return build_route(parts, [calibration_point(point) for point in points])
+    return build_route(parts, [CalibrationPoint(**point) for point in points])
 
 
 def build_route(parts: Sequence[Sequence[Sequence[float]]], points: Sequence[CalibrationPoint]) -> Route:
@@ -242,11 +318,6 @@ def build_route(parts: Sequence[Sequence[Sequence[float]]], points: Sequence[Cal
     """
     axis = Axis(parts)
     return Route(axis, calibrate(axis.part_ranges_m, points))
-
-
-def calibration_point(stored: StoredStation) -> CalibrationPoint:
-    """A calibration point as it is stored."""
-    return CalibrationPoint(stored["part"], stored["chainage_m"], stored["measure_m"], stored["ahead_m"])
 
 
 def is_ambiguous(feet: Sequence[Foot]) -> bool:

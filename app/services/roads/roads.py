@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import datetime, timedelta
 
 import sqlalchemy as sa
@@ -25,18 +25,21 @@ from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.markers.searches import marker_document
 from app.services.ports import Clock
 from app.services.roads.documents import (
-    CalibrationInput,
+    AnyLine,
+    AxisIn,
     ChangedRoad,
-    LinesInput,
     MeasuredMarkers,
     OnRoad,
     RoadDocument,
+    RoadIn,
     RoadLocatedMany,
     RoadPage,
+    RoadPatch,
     RoadPlacedMany,
     RoadVersionDocument,
     RoadVersionPage,
     Route,
+    StationIn,
     build_route,
     located_position,
     place_lines,
@@ -54,29 +57,6 @@ _SAME_M = 5e-5
 
 Range = tuple[float | None, float | None]
 Measured = tuple[Mapping[str, object], Route]
-
-
-@dataclass(frozen=True, slots=True)
-class NewRoad:
-    """A road to register."""
-
-    name: str
-    lines: LinesInput
-    calibration: tuple[CalibrationInput, ...] = ()
-    measure_markers: bool = True
-    dry_run: bool = False
-    reason: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class RoadChange:
-    """What to change; None stays."""
-
-    lines: LinesInput | None = None
-    calibration: tuple[CalibrationInput, ...] | None = None
-    measure_markers: bool = True
-    dry_run: bool = False
-    reason: str | None = None
 
 
 class _NotStored(Exception):
@@ -104,7 +84,7 @@ class Roads:
         self._accuracy_m = crs_accuracy_m
         self._ttl = idempotency_ttl
 
-    def register(self, caller: Caller, new: NewRoad, key: IdempotencyKey | None = None) -> tuple[ChangedRoad, bool]:
+    def register(self, caller: Caller, new: RoadIn, key: IdempotencyKey | None = None) -> tuple[ChangedRoad, bool]:
         """Store a new road, and measure the markers that name it.
 
         Returns
@@ -123,7 +103,7 @@ class Roads:
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
-        columns, route = self._columns(new.lines, new.calibration)
+        columns, route = self._columns(new, new.geometry, new.calibration)
         try:
             with write_once(self._database, caller.agency_id, key, now, self._ttl, long=True) as (connection, answer):
                 if answer.replayed:
@@ -142,7 +122,7 @@ class Roads:
             document["id"] = None
         return document, False
 
-    def change(self, caller: Caller, road_id: str, change: RoadChange, version: int | None) -> ChangedRoad:
+    def change(self, caller: Caller, road_id: str, change: RoadPatch, version: int | None) -> ChangedRoad:
         """Change a road that is still at `version`, and measure its markers again: their positions stay.
 
         Raises
@@ -265,9 +245,9 @@ class Roads:
         route = route_of(row)
         return {"road_id": road_id, "road": row.name, "version": row.version, "sections": sections(route)}, route
 
-    def _columns(self, lines: LinesInput, given: Sequence[CalibrationInput]) -> Measured:
-        placed = place_lines(lines, self._accuracy_m)
-        points = resolve_calibration(build_route(placed.parts, ()).axis, lines, given, self._accuracy_m)
+    def _columns(self, axis: AxisIn, geometry: AnyLine, stations: Sequence[StationIn]) -> Measured:
+        placed = place_lines(geometry, axis, self._accuracy_m)
+        points = resolve_calibration(build_route(placed.parts, ()).axis, axis, stations, self._accuracy_m)
         route = build_route(placed.parts, points)
         columns = {
             "parts": placed.parts,
@@ -276,7 +256,7 @@ class Roads:
                 "realization": placed.realization,
                 "epoch": placed.epoch,
                 "transform_accuracy_m": placed.transform_accuracy_m,
-                "several": lines.several,
+                "several": geometry.type == "MultiLineString",
             },
             "calibration": [asdict(point) for point in points],
             "localization_grade": placed.grade,
@@ -285,8 +265,8 @@ class Roads:
         }
         return columns, route
 
-    def _changed(self, row: RoadRow, change: RoadChange) -> Measured:
-        if change.lines is not None:
+    def _changed(self, row: RoadRow, change: RoadPatch) -> Measured:
+        if change.geometry is not None:
             if change.calibration is None and row.calibration:
                 raise InvalidParameter(
                     "a new geometry comes with its calibration",
@@ -294,11 +274,11 @@ class Roads:
                     limit="the calibration points on the new geometry, or []",
                     cure="send calibration; [] for true metres from 0",
                 )
-            return self._columns(change.lines, change.calibration or ())
+            return self._columns(change, change.geometry, change.calibration or ())
         if change.calibration is None:
             return {}, route_of(row)
-        lines = LinesInput((), crs=row.given["crs"], epoch=row.given["epoch"])
-        points = resolve_calibration(route_of(row).axis, lines, change.calibration, self._accuracy_m)
+        axis = AxisIn(crs=row.given["crs"], epoch=row.given["epoch"])
+        points = resolve_calibration(route_of(row).axis, axis, change.calibration, self._accuracy_m)
         route = build_route(row.parts, points)
         return {"calibration": [asdict(point) for point in points], **_extent(route)}, route
 

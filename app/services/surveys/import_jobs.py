@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from datetime import timedelta
-from typing import Any
 
 from app.formats.format import SpooledFile
 from app.registry import jobs as store
@@ -16,13 +14,8 @@ from app.services.blobs import staged
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, JobQueue
-from app.services.surveys.import_report import (
-    ImportJobDocument,
-    ImportJobPage,
-    import_input,
-    import_job_document,
-    import_job_summary,
-)
+from app.services.progress import JobDocument, job_document
+from app.services.surveys.import_report import DeclarationIn, ImportInput, import_input
 from app.services.surveys.imports import SETTLED, Imports
 
 IMMEDIATE_BYTES = 4 * 1024**2
@@ -58,65 +51,30 @@ class ImportJobs:
         self._database, self._clock, self._blobs, self._queue = database, clock, blobs, queue
         self._imports, self._ttl = imports, idempotency_ttl
 
-    def submit(
-        self, caller: Caller, declared: Mapping[str, Any], file: SpooledFile, key: IdempotencyKey | None
-    ) -> tuple[ImportJobDocument, bool]:
+    def submit(self, caller: Caller, given: ImportInput, key: IdempotencyKey | None) -> tuple[JobDocument, bool]:
         """Store the file and queue its import.
-
-        Parameters
-        ----------
-        declared : mapping
-            See `import_input`.
 
         Returns
         -------
-        job : ImportJobDocument
+        job : JobDocument
         replayed : bool
             The request had been made before under the same Idempotency-Key.
-
-        Raises
-        ------
-        InvalidParameter
-            The declaration contradicts itself.
         """
-        import_input(declared, file)
         now, agency_id = self._clock(), caller.agency_id
         with staged(self._blobs) as stage:
             job = new_job(
                 JobKind.IMPORT, new_id(now), agency_id, caller.key_id, now,
-                job_input={"declaration": dict(declared), "label": caller.label},
-                upload_key=stage.add("uploads", file),
+                job_input={"declaration": given.declaration.model_dump(mode="json"), "label": caller.label},
+                upload_key=stage.add("uploads", given.file),
             )  # fmt: skip
             with write_once(self._database, agency_id, key, now, self._ttl) as (connection, answer):
                 if answer.replayed:
                     return answer.response, True
                 store.add_job(connection, job)
-                document = answer.store(import_job_document(job))
+                document = answer.store(job_document(job, now))
             stage.keep()
         self._queue.submit(job.id, job.agency_id, JobKind.IMPORT)
         return document, False
-
-    def get(self, caller: Caller, import_id: str) -> ImportJobDocument:
-        """A job with its report, once there is one.
-
-        Raises
-        ------
-        NotFound
-            There is none with this id, or it belongs to another agency.
-        """
-        with self._database.read() as connection:
-            return import_job_document(store.get_job(connection, caller.agency_id, JobKind.IMPORT, import_id))
-
-    def page(
-        self, caller: Caller, *, state: str | None = None, before: str | None = None, limit: int = 100
-    ) -> tuple[ImportJobPage, str | None]:
-        """A page of jobs without their reports, newest first, and the id to continue before."""
-        with self._database.read() as connection:
-            rows = store.list_jobs(
-                connection, caller.agency_id, JobKind.IMPORT, state=state, before=before, limit=limit + 1
-            )
-        page = ImportJobPage(items=[import_job_summary(row) for row in rows[:limit]])
-        return page, rows[limit - 1].id if len(rows) > limit else None
 
     def run(self, job: RunningJob) -> None:
         """Import a survey that was queued; the handler of jobs of the kind `JobKind.IMPORT`."""
@@ -131,7 +89,7 @@ class ImportJobs:
 
         step(_STARTED)
         with self._blobs.opened(row.upload_key) as file:
-            given = import_input(row.input["declaration"], file)
+            given = import_input(DeclarationIn.model_validate(row.input["declaration"]), file)
             report, _ = self._imports.run(caller, given, IdempotencyKey(f"import {row.id}", row.id, ""), step)
         with self._database.write() as connection:
             job.finish(connection, report)

@@ -2,29 +2,110 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from typing import Annotated, Any, Final, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, cast
 
 import numpy as np
-from pydantic import Field, JsonValue
+from pydantic import BaseModel, Field, JsonValue, create_model
 from typing_extensions import TypedDict
 
-from app.errors import naming
-from app.families import FAMILIES
+from app.errors import InvalidParameter, naming
+from app.families import FAMILIES, FamilyName
 from app.families.surveys import Rows
 from app.formats.format import SpooledFile
-from app.formats.surveys.declaration import ControlPoint, ImportDeclaration, LocalGrid
+from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.table import Change, Detected, Fault, Severity
+from app.inputs import INPUT, Flag, Text
 from app.plots.track import draw_residuals
 from app.registry.conditions import grade_columns
-from app.registry.jobs import JobRow, JobState
 from app.registry.marker_rows import MarkerRow
-from app.services.documents import ErrorDocument, cut_text, document_of
+from app.services.documents import cut_text, document_of
 from app.services.markers.plausibility import AccuracyDocument, accuracy_document
 from app.surveys.comparison import Comparison, ComparisonFigures
 from app.surveys.georeference import GeoreferencedSurvey, LocalGridDocument
+
+# === What is declared of an import: of the file, of its markers, and what is done with it.
+
+
+DECLARATION_EXAMPLE: dict[str, Any] = {
+    "layout": "pnezd",
+    "crs": "EPSG:25832",
+    "epoch": 2025.4,
+    "vertical_datum": "ellipsoid",
+    "family": "cerpm",
+    "columns": {"code": "point"},
+    "side": "left",
+    "area_deg": [8.3, 48.9, 8.6, 49.1],
+    "survey": {"horizontal_rmse_m": 0.015, "survey_method": "GNSS RTK", "surveyor": "A. Muster"},
+    "dry_run": True,
+}
+
+
+SURVEY_IMPORTS = {family.name: family.survey for family in FAMILIES if family.survey is not None}
+"""Families whose markers can be imported from points, and how."""
+MAX_ROWS_LISTED = 2000
+"""Rows of a survey that a report can list; about 200 kB."""
+
+
+if TYPE_CHECKING:
+
+    class _FamilyMembers(BaseModel):
+        """Members of a declaration that only one family has, of all families."""
+
+else:
+    _FamilyMembers = create_model(
+        "_FamilyMembers", __base__=tuple(survey.members for survey in SURVEY_IMPORTS.values())
+    )
+
+
+class DeclarationIn(ImportDeclaration, _FamilyMembers):
+    """What is declared of a survey."""
+
+    model_config = INPUT | {"frozen": True, "json_schema_extra": {"examples": [DECLARATION_EXAMPLE]}}
+
+    family: FamilyName = "plate"
+    dry_run: Flag = Field(False, description="Report only; nothing is stored.")
+    mode: Literal["all", "good"] = Field("all", description="Store all rows or none, or the good ones.")
+    warnings: Literal["store", "refuse"] = Field(
+        "store", description="What a warning means: its row is stored, or refused as a faulty one is."
+    )
+    list_rows: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS_LISTED)] = Field(
+        0, description="Rows that the report lists with their positions, those with faults first."
+    )
+    reason: Annotated[Text, Field(min_length=1, max_length=500)] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ImportInput:
+    """A file with what is declared of it; `defaults` are what its markers have in common, as their family knows it."""
+
+    file: SpooledFile
+    declaration: DeclarationIn
+    defaults: Any
+
+
+def import_input(declaration: DeclarationIn, file: SpooledFile) -> ImportInput:
+    """A file with its declaration.
+
+    Raises
+    ------
+    InvalidParameter
+        Members of a family contradict each other, or the family's markers are no points; the field is below
+        ``declaration``.
+    """
+    members = declaration.model_dump()
+    with naming("declaration"):  # members of the other families are checked too
+        defaults = {name: survey.defaults(members) for name, survey in SURVEY_IMPORTS.items()}
+        if declaration.family not in defaults:
+            raise InvalidParameter(
+                f"{declaration.family!r} cannot be imported from points",
+                field="family",
+                limit=", ".join(SURVEY_IMPORTS),
+                cure="register markers of the other families one by one or in bulk: POST /v1/markers",
+            )
+    return ImportInput(file, declaration, defaults[declaration.family])
+
 
 # === What the API returns about imports of surveys.
 
@@ -63,14 +144,6 @@ class SurveyRow(TypedDict):
     height_m: Annotated[float | None, Field(description="Above the declared vertical datum.")]
 
 
-class DetectedDocument(TypedDict):
-    """A property of the file that was not declared, and the evidence for it."""
-
-    what: str
-    value: str
-    evidence: str
-
-
 class Residual(TypedDict):
     """Surveyed position minus registered position of one row."""
 
@@ -101,7 +174,7 @@ class ImportReport(TypedDict):
     crs: str
     localization_grade: str
     transform_note: str | None
-    detected: Annotated[list[DetectedDocument], Field(description="What was not declared, with its evidence.")]
+    detected: Annotated[list[Detected], Field(description="What was not declared, with its evidence.")]
     local_grid: LocalGridDocument | None
     accuracy: Annotated[AccuracyDocument, Field(description="Of the RMSE that was declared for the whole survey.")]
     rows: int
@@ -116,48 +189,6 @@ class ImportReport(TypedDict):
     faults: Annotated[list[FaultDocument], Field(description="The first thousand, refusals first.")]
     faults_left_out: int
     listed: Annotated[list[SurveyRow], Field(description="As many rows as `list_rows` asks for.")]
-
-
-class ImportJobLinks(TypedDict):
-    """Where to read the job again."""
-
-    self: str
-
-
-class ImportJobSummary(TypedDict):
-    """An import that is or was a job, without its report."""
-
-    id: str
-    state: JobState
-    progress: Annotated[float, Field(description="0 to 1.")]
-    attempts: int
-    cancel_requested: Annotated[bool, Field(description="A running import stops before it stores anything.")]
-    created_at: datetime
-    finished_at: datetime | None
-    error: Annotated[ErrorDocument | None, Field(description="Why the file or its declaration cannot be used.")]
-    links: ImportJobLinks
-
-
-class ImportJobDocument(ImportJobSummary):
-    """An import that is or was a job."""
-
-    report: ImportReport | None
-
-
-class ImportJobPage(TypedDict):
-    """A page of imports, newest first; the Link header leads to the next one."""
-
-    items: list[ImportJobSummary]
-
-
-def import_job_document(job: JobRow) -> ImportJobDocument:
-    """An import with its report, once there is one."""
-    return {**import_job_summary(job), "report": cast("ImportReport | None", job.result)}
-
-
-def import_job_summary(job: JobRow) -> ImportJobSummary:
-    """An import without its report."""
-    return document_of(ImportJobSummary, job, links={"self": f"/v1/imports/{job.id}"})
 
 
 def comparison_document(
@@ -177,11 +208,6 @@ def comparison_document(
     ]
     drawn = draw_residuals(survey, found, tolerance_m)
     return {**found.document(tolerance_m), "residuals": residuals, "map_svg": drawn}
-
-
-def detected_document(detected: Detected) -> DetectedDocument:
-    """A detected property as reports of imports have it."""
-    return document_of(DetectedDocument, detected)
 
 
 def fault_document(fault: Fault) -> FaultDocument:
@@ -214,24 +240,7 @@ def merge_patch(changes: Sequence[Change]) -> dict[str, JsonValue] | None:
 
 ALL: Final = "all"
 MAX_FAULTS = 1000
-MAX_ROWS_LISTED = 2000
-"""Rows of a survey that a report can list; about 200 kB."""
-_ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
 _MAX_CELL = 80
-
-
-@dataclass(frozen=True, slots=True)
-class ImportInput:
-    """A file with what is declared of it."""
-
-    file: SpooledFile
-    declaration: ImportDeclaration
-    defaults: Any = None
-    dry_run: bool = False
-    mode: Literal["all", "good"] = ALL
-    reason: str | None = None
-    refuse_warnings: bool = False
-    list_rows: int = 0
 
 
 def import_report(
@@ -249,40 +258,40 @@ def import_report(
     refused = faults.flags(table.rows, Severity.REFUSED)
     warned = faults.flags(table.rows, Severity.WARNING)
     shown = faults.shown(MAX_FAULTS)
-    rmse_m = request.declaration.survey.get("horizontal_rmse_m")
-    grade = grade_columns(rmse_m, placed.transform_accuracy_m, placed.note)
+    declared, stated = request.declaration, request.declaration.survey
+    grade = grade_columns(stated.horizontal_rmse_m, placed.transform_accuracy_m, placed.note)
     lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
     return {
         "outcome": outcome,
-        "dry_run": request.dry_run,
-        "mode": request.mode,
-        "warnings": "refuse" if request.refuse_warnings else "store",
+        "dry_run": declared.dry_run,
+        "mode": declared.mode,
+        "warnings": declared.warnings,
         "format": table.format,
         "file_sha256": request.file.sha256,
         "crs": table.crs,
         "localization_grade": grade["localization_grade"],
         "transform_note": grade["transform_note"],
-        "detected": [detected_document(detected) for detected in table.detected],
+        "detected": list(table.detected),
         "local_grid": local_grid,
-        "accuracy": accuracy_document(*(request.declaration.survey.get(name) for name in _ACCURACY)),
+        "accuracy": accuracy_document(stated.horizontal_rmse_m, stated.vertical_rmse_m, stated.check_points),
         "rows": table.rows,
         "good_rows": len(good_rows),
         "refused_rows": int(refused.sum()),
         "warned_rows": int((warned & ~refused).sum()),
-        "left_out_rows": sum(row <= table.rows for row in set(request.declaration.leave_out)),
+        "left_out_rows": sum(row <= table.rows for row in set(declared.leave_out)),
         "stored": stored,
         "extent_deg": [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())] if len(lon) else None,
         "counts": dict(faults.counts),
         "comparison": comparison,
         "faults": [fault_document(fault) for fault in shown],
         "faults_left_out": len(faults) - len(shown),
-        "listed": _listed_rows(request, survey, shown) if request.list_rows else [],
+        "listed": _listed_rows(request, survey, shown) if declared.list_rows else [],
     }
 
 
 def _listed_rows(request: ImportInput, survey: GeoreferencedSurvey, shown: list[Fault]) -> list[SurveyRow]:
     """Rows with faults, and others evenly spread over the file, in the order of the file."""
-    rows, most = survey.table.rows, request.list_rows
+    rows, most = survey.table.rows, request.declaration.list_rows
     faulty = dict.fromkeys(fault.row - 1 for fault in shown if fault.row is not None and fault.row <= rows)
     chosen = set(list(faulty)[:most])
     if rows <= most:
@@ -324,50 +333,3 @@ def _row(survey: GeoreferencedSurvey, index: int, state: RowState) -> SurveyRow:
 def _cell(survey: GeoreferencedSurvey, role: str, index: int) -> str | None:
     texts = survey.table.texts.get(role)
     return (texts[index][:_MAX_CELL] or None) if texts is not None else None
-
-
-# === What was declared of a survey, as the API takes it and as a queued import stores it, becomes typed values.
-
-
-SURVEY_IMPORTS = {family.name: family.survey for family in FAMILIES if family.survey is not None}
-"""Families whose markers can be imported from points, and how."""
-_NOT_OF_THE_SURVEY = {"dry_run", "mode", "reason", "warnings", "list_rows"}.union(
-    *(s.members.model_fields for s in SURVEY_IMPORTS.values())
-)
-
-
-def import_input(declared: Mapping[str, Any], file: SpooledFile) -> ImportInput:
-    """A file with its declaration.
-
-    Parameters
-    ----------
-    declared : mapping
-        JSON, with the members of `app.api.surveys.schemas.DeclarationIn`, all of them.
-    file : SpooledFile
-        The survey.
-
-    Raises
-    ------
-    InvalidParameter
-        A value is out of its limits, or values contradict each other; the field is below ``declaration``.
-    """
-    values = {name: value for name, value in declared.items() if name not in _NOT_OF_THE_SURVEY}
-    for name in ("area_deg", "height_range_m"):
-        values[name] = tuple(values[name]) if values[name] is not None else None
-    values["leave_out"] = tuple(values.get("leave_out", ()))
-    with naming("declaration"):
-        if (grid := values["local_grid"]) is not None:
-            points = tuple(ControlPoint(**point) for point in grid["control_points"])
-            values["local_grid"] = LocalGrid(**{**grid, "control_points": points})
-        defaults = _defaults(declared)
-        declaration = ImportDeclaration(**values)
-    strict = declared["warnings"] == "refuse"
-    rows = declared.get("list_rows", 0)
-    return ImportInput(
-        file, declaration, defaults, declared["dry_run"], declared["mode"], declared["reason"], strict, rows
-    )
-
-
-def _defaults(declared: Mapping[str, Any]) -> Any:
-    """Of the declared family; members of the other families are checked too."""
-    return {name: survey.defaults(declared) for name, survey in SURVEY_IMPORTS.items()}.get(declared["family"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
@@ -206,7 +207,7 @@ def common_columns(
 ) -> Columns:
     """Columns that markers of every family have: place, provenance, road."""
     placed, provenance, texts, numbers = survey.placed, declaration.survey, survey.table.texts, survey.table.numbers
-    rmse_m = provenance.get("horizontal_rmse_m")
+    rmse_m = provenance.horizontal_rmse_m
     same = {
         "family": declaration.family,
         "status": declaration.status or PLANNED,
@@ -214,14 +215,14 @@ def common_columns(
         "heading_deg": None,
         "heading_rmse_deg": None,
         "horizontal_rmse_m": rmse_m,
-        "vertical_rmse_m": provenance.get("vertical_rmse_m"),
+        "vertical_rmse_m": provenance.vertical_rmse_m,
         "crs": placed.crs,
         "realization": placed.realization,
         "epoch": placed.epoch,
-        "survey_method": provenance.get("survey_method"),
-        "check_points": provenance.get("check_points"),
-        "surveyor": provenance.get("surveyor"),
-        "instrument": provenance.get("instrument"),
+        "survey_method": provenance.survey_method,
+        "check_points": provenance.check_points,
+        "surveyor": provenance.surveyor,
+        "instrument": provenance.instrument,
         "survey_file_sha256": file_sha256,
         **grade_columns(rmse_m, placed.transform_accuracy_m, placed.note),
         "measure_m": None,
@@ -266,7 +267,7 @@ def _originals(survey: GeoreferencedSurvey, rows: Rows, declaration: ImportDecla
         epoch=declaration.epoch,
         vertical_datum=declaration.vertical_datum,
     )
-    of_survey = {**_known(**declaration.survey), "file_sha256": sha256, "format": table.format}
+    of_survey = {**_known(**asdict(declaration.survey)), "file_sha256": sha256, "format": table.format}
     own: dict[str, Sequence[Any]] = {
         names[0]: written[0][rows].tolist(),
         names[1]: written[1][rows].tolist(),

@@ -7,7 +7,7 @@ whether anything is, follows from the faults of each row.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from app.errors import InvalidParameter
 from app.families import get_family
 from app.families.family import Registration
 from app.families.surveys import PLANNED, MarkerRules, RowCodes, Rows, SurveyImport
-from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Faults, Severity
 from app.registry import markers as store
@@ -36,6 +35,7 @@ from app.services.roads.documents import linear_references
 from app.services.surveys.import_report import (
     ALL,
     SURVEY_IMPORTS,
+    DeclarationIn,
     ImportInput,
     ImportReport,
     Outcome,
@@ -111,7 +111,6 @@ class Imports:
         Unavailable
             The decoder processes are busy.
         """
-        given = _with_defaults(given)
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
@@ -128,7 +127,7 @@ class Imports:
         with self._database.read() as connection:
             checked = running.check_against_registry(connection)
         step(SETTLED)
-        if given.dry_run:
+        if given.declaration.dry_run:
             with self._database.read() as connection:
                 prepared = running.prepare(connection, checked)
             return running.report("checked", prepared), False
@@ -143,21 +142,6 @@ class Imports:
                 return running.report("refused", prepared), False
             count = running.store(connection, prepared, stored)
             return answer.store(running.report("stored", prepared, count)), False
-
-
-def _with_defaults(request: ImportInput) -> ImportInput:
-    """With the family's own defaults where nothing is declared that its markers have in common."""
-    declaration = request.declaration
-    if declaration.family not in SURVEY_IMPORTS:
-        raise InvalidParameter(
-            f"{declaration.family[:40]!r} cannot be imported from points",
-            field="declaration.family",
-            limit=", ".join(SURVEY_IMPORTS),
-            cure="register markers of the other families one by one or in bulk: POST /v1/markers",
-        )
-    if request.defaults is not None:
-        return request
-    return replace(request, defaults=SURVEY_IMPORTS[declaration.family].defaults({}))
 
 
 def _code_form(request: ImportInput) -> CodeForm:
@@ -196,7 +180,7 @@ class _Import:
     registration: Registration
 
     @property
-    def declaration(self) -> ImportDeclaration:
+    def declaration(self) -> DeclarationIn:
         return self.request.declaration
 
     @property
@@ -217,7 +201,7 @@ class _Import:
             return np.empty(0, dtype=np.intp)
         rows = self.survey.table.rows
         bad = self.faults.flags(rows, Severity.REFUSED)
-        if self.request.refuse_warnings:
+        if self.declaration.warnings == "refuse":
             bad |= self.faults.flags(rows, Severity.WARNING)
         return np.flatnonzero(~bad & self.survey.placed.placed)
 
@@ -226,12 +210,12 @@ class _Import:
         """Whether nothing can be stored, whatever the codes are."""
         rows = self.survey.table.rows
         kept_rows = rows - sum(1 <= row <= rows for row in set(self.declaration.leave_out))
-        return self._refuses_file or (self.request.mode == ALL and len(self.good_rows()) < kept_rows)
+        return self._refuses_file or (self.declaration.mode == ALL and len(self.good_rows()) < kept_rows)
 
     @property
     def _refuses_file(self) -> bool:
         has_warning = bool(self.faults.file_warnings - _ALWAYS_WARNED)
-        return self.faults.refuses_file or (self.request.refuse_warnings and has_warning)
+        return self.faults.refuses_file or (self.declaration.warnings == "refuse" and has_warning)
 
     # --- checks -----------------------------------------------------------------------------------------------------
 
@@ -239,7 +223,7 @@ class _Import:
         """Check the rows against each other."""
         stated = self.declaration.survey
         self.faults.add(check_consistency(self.survey))
-        self.faults.add(check_accuracy(stated.get("horizontal_rmse_m"), stated.get("vertical_rmse_m")))
+        self.faults.add(check_accuracy(stated.horizontal_rmse_m, stated.vertical_rmse_m))
 
     def check_against_registry(self, connection: sa.Connection) -> _Checked:
         """Check the survey against the places of registered markers."""
@@ -350,7 +334,7 @@ class _Import:
         self, connection: sa.Connection, entry: AuditEntry, codes: RowCodes, stored: Callable[[int, int], None]
     ) -> int:
         sha256, now, total = self.request.file.sha256, self.registration.now, len(codes.rows)
-        why = self.request.reason or f"import of {sha256[:12]}"
+        why = self.declaration.reason or f"import of {sha256[:12]}"
         count = 0
         with store.many_markers(connection, total):
             for number, start in enumerate(range(0, total, _PART)):
@@ -411,7 +395,7 @@ class _Import:
                 values,
                 version=marker.version,
                 kind=kind_of_change(marker.status, values["status"], moved=True),
-                why=self.request.reason or f"as built, import of {sha256[:12]}",
+                why=self.declaration.reason or f"as built, import of {sha256[:12]}",
             )
             count += 1
         return count

@@ -6,7 +6,7 @@ const AGAIN_MS = 1500;
 /** States of a job that has ended. */
 export const ENDED = ["done", "failed", "cancelled"];
 
-/** @typedef {import("./schema.js").components["schemas"]["JobDocument"]} Job */
+/** @typedef {import("./schema.js").components["schemas"]["JobSummary"]} Job */
 
 /**
  * Follow a job until it has ended. A stream that breaks off is opened again.

@@ -9,7 +9,25 @@ import { number } from "../format.js";
 import { t, textOr } from "../texts/index.js";
 import { ProblemBox } from "./problem.js";
 
-/** @typedef {import("../api/follow_job.js").Job} Job */
+/**
+ * @typedef {import("../api/follow_job.js").Job} Job
+ * @typedef {import("../api/schema.js").paths["/v1/jobs/{job_id}"]["get"]["responses"][200]["content"]["application/json"]} AnyJob
+ */
+
+/**
+ * A job with its result.
+ *
+ * @template {AnyJob["kind"]} Kind
+ * @param {string} id
+ * @param {Kind} kind Another one is refused, as if there were none.
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<Extract<AnyJob, { kind: Kind }>>}
+ */
+export async function oneJob(id, kind, signal) {
+  const job = await ok(api.GET("/v1/jobs/{job_id}", { params: { path: { job_id: id } }, signal }));
+  if (job.kind !== kind) throw new Problem({ title: t("job.none"), status: 404 });
+  return /** @type {any} */ (job);
+}
 
 /**
  * @param {{ id: string, onDone?: (job: Job) => void, onChange?: (job: Job) => void }} props `onDone` is called once, `onChange` whenever

@@ -2,10 +2,10 @@
 
 import { html } from "htm/preact";
 
-import { api, ok, Problem } from "../api/client.js";
+import { Problem } from "../api/client.js";
 import { Verdict } from "../components/badges.js";
 import { Facts } from "../components/facts.js";
-import { JobProgress } from "../components/job.js";
+import { JobProgress, oneJob } from "../components/job.js";
 import { Shown, useLoad } from "../components/load.js";
 import { PagesFoot, usePages } from "../components/pages.js";
 import { ProblemBox } from "../components/problem.js";
@@ -25,7 +25,7 @@ export default function Imports({ parameters }) {
 }
 
 function All() {
-  const list = usePages("/v1/imports");
+  const list = usePages("/v1/jobs", { kind: "import" });
   return html`
     <h1>${t("imports.title")}</h1>
     <p class="lead">${t("imports.lead")}</p>
@@ -50,22 +50,22 @@ const State = ({ state }) => html`<${Verdict} level=${LEVELS[state] ?? "none"}>$
 
 /** @param {{ id: string }} props */
 function One({ id }) {
-  const found = useLoad((signal) => ok(api.GET("/v1/imports/{import_id}", { params: { path: { import_id: id } }, signal })), [id]);
+  const found = useLoad((signal) => oneJob(id, "import", signal), [id]);
   return html`
     <h1>${t("imports.one")}</h1>
     <p><a href="/imports">${t("imports.all")}</a></p>
-    <${Shown} of=${found}>${(/** @type {import("../api/schema.js").components["schemas"]["ImportJobDocument"]} */ job) => html`
+    <${Shown} of=${found}>${(/** @type {import("../api/schema.js").components["schemas"]["ImportJob"]} */ job) => html`
       <section class="card">
         ${UNFINISHED.includes(job.state) ? html`<${JobProgress} id=${id} onDone=${found.reload} />` : html`<p><${State} state=${job.state} /></p>`}
         ${job.error && html`<${ProblemBox} error=${new Problem({ title: t("job.failed"), ...job.error })} />`}
         <${Facts} of=${[[t("field.created_at"), time(job.created_at)], [t("field.finished_at"), job.finished_at && time(job.finished_at)]]} />
-        ${job.report && html`<${Summary} report=${job.report} /><p class="buttons"><${Downloads} report=${job.report} /></p>${job.report.outcome === "stored" && html`<${Stored} report=${job.report} />`}`}
+        ${job.result && html`<${Summary} report=${job.result} /><p class="buttons"><${Downloads} report=${job.result} /></p>${job.result.outcome === "stored" && html`<${Stored} report=${job.result} />`}`}
       </section>
-      ${job.report && html`
-        ${job.report.listed.length > 0 && html`<section class="card"><h2>${t("imports.rows_title")}</h2><${Rows} report=${job.report} family="plate" /></section>`}
-        <section class="card"><h2>${t("imports.faults")}</h2><${Faults} report=${job.report} /></section>
-        <${Comparison} report=${job.report} />
-        <section class="card"><h2>${t("imports.detected")}</h2><${Detected} report=${job.report} /></section>
+      ${job.result && html`
+        ${job.result.listed.length > 0 && html`<section class="card"><h2>${t("imports.rows_title")}</h2><${Rows} report=${job.result} family="plate" /></section>`}
+        <section class="card"><h2>${t("imports.faults")}</h2><${Faults} report=${job.result} /></section>
+        <${Comparison} report=${job.result} />
+        <section class="card"><h2>${t("imports.detected")}</h2><${Detected} report=${job.result} /></section>
       `}
     `}</${Shown}>
   `;

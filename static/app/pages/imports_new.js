@@ -7,7 +7,7 @@ import { useEffect, useId, useRef, useState } from "preact/hooks";
 import { Problem, request, save } from "../api/client.js";
 import { DropArea } from "../components/drop.js";
 import { FormFrame, loadSchema, useForm } from "../components/form.js";
-import { JobProgress } from "../components/job.js";
+import { JobProgress, oneJob } from "../components/job.js";
 import { Shown, useLoad } from "../components/load.js";
 import { notify } from "../components/notices.js";
 import { fileSize, number } from "../format.js";
@@ -106,8 +106,9 @@ function Steps({ schema, onStored }) {
     },
   };
   const ended = async () => {
-    const found = await (await request(`/v1/imports/${job?.id}`)).json();
-    if (found.report && job) show(found.report, job.values);
+    if (!job) return;
+    const { result } = await oneJob(job.id, "import");
+    if (result) show(result, job.values);
     setJob(null);
   };
   const example = () => {

@@ -8,7 +8,7 @@ import { Verdict } from "../components/badges.js";
 import { Changes, nameOf, valueText } from "../components/changes.js";
 import { Dialog } from "../components/dialog.js";
 import { Facts } from "../components/facts.js";
-import { JobProgress } from "../components/job.js";
+import { JobProgress, oneJob } from "../components/job.js";
 import { ChoiceFilter, closeTo, filterOf, linked, ListPage, TextFilter } from "../components/list_page.js";
 import { Empty, Shown, useLoad } from "../components/load.js";
 import { attempt } from "../components/notices.js";
@@ -130,8 +130,8 @@ function VersionChange({ items, number: written }) {
 
 /** @param {{ id: string, onClose: () => void }} props */
 function Check({ id, onClose }) {
-  const found = useLoad((signal) => ok(api.GET("/v1/audit/verifications/{verification_id}", { params: { path: { verification_id: id } }, signal })), [id]);
-  const result = /** @type {any} */ (found.data)?.result;
+  const found = useLoad((signal) => oneJob(id, "audit", signal), [id]);
+  const result = found.data?.result;
   return html`
     <${Dialog} title=${t("audit.check")} onClose=${onClose}>
       <p>${t("audit.check_text")}</p>
@@ -140,7 +140,7 @@ function Check({ id, onClose }) {
         <p><${Verdict} level=${result.fault_count ? "bad" : "good"}>${result.fault_count ? t("audit.faults", { count: number(result.fault_count) }) : t("audit.sound")}</${Verdict}></p>
         <${Facts} of=${[[t("audit.entries"), number(result.entries)], [t("audit.versions"), number(result.versions)], [t("audit.head"), result.head && code(result.head)]]} />
         <p class="hint">${t("audit.head_hint")}</p>
-        <ul class="plain">${result.faults.map((/** @type {any} */ fault) => html`<li><strong>${fault.where}</strong>: ${fault.what}</li>`)}</ul>
+        <ul class="plain">${result.faults.map((fault) => html`<li><strong>${fault.where}</strong>: ${fault.what}</li>`)}</ul>
       `}
     </${Dialog}>
   `;

@@ -120,7 +120,7 @@ function One({ id, onChanged }) {
 function Result({ job }) {
   const path = job.links.result;
   if (!path) return null;
-  const page = pageOf(path);
+  const page = job.kind === "import" ? `/imports/${job.id}` : pageOf(path);
   if (page) return html`<p><a class="button" href=${page}>${t("jobs.result")}</a></p>`;
   const isFile = path.endsWith("/result") || path.endsWith("/package");
   if (isFile && !may(path.endsWith("/package") ? "GET /v1/plans/{plan_id}/package" : "GET /v1/jobs/{job_id}/result")) return null;
@@ -133,7 +133,7 @@ function Result({ job }) {
 
 /** The page that shows a resource of the API. @param {string} path */
 function pageOf(path) {
-  const found = /^\/v1\/(decodes|imports|plans|reprocessings)\/([^/]+)(?:\/(?:proof))?$/.exec(path);
+  const found = /^\/v1\/(decodes|plans|reprocessings)\/([^/]+)(?:\/(?:proof))?$/.exec(path);
   if (!found) return null;
   return found[1] === "reprocessings" ? `/operations/reprocessings/${found[2]}` : `/${found[1]}/${found[2]}`;
 }

@@ -5,7 +5,7 @@ import { useState } from "preact/hooks";
 
 import { api, download, jsonBody, ok, request } from "../api/client.js";
 import { bodyOf, CheckField, ChecksField, FormFrame, Group, loadSchema, SchemaField, SelectField, TextField, useForm } from "../components/form.js";
-import { JobProgress } from "../components/job.js";
+import { JobProgress, oneJob } from "../components/job.js";
 import { Shown, useLoad } from "../components/load.js";
 import { attempt } from "../components/notices.js";
 import { fileSize } from "../format.js";
@@ -59,11 +59,10 @@ function Package({ plan }) {
   const { job, start } = useUnfinished(plan, "package");
   const [turn, setTurn] = useState(0);
   const form = useForm({ formats: "pdf, svg" });
-  const schema = useLoad(() => loadSchema("PackageIn"), []);
+  const schema = useLoad(() => loadSchema("PackageOptions"), []);
   const packed = useLoad(async (signal) => {
-    const { items } = await ok(api.GET("/v1/plan-jobs", { params: { query: { plan_id: plan.id, state: "done", limit: 50 } }, signal }));
-    const last = items.find(({ kind }) => kind === "package");
-    return last ? (await ok(api.GET("/v1/plan-jobs/{job_id}", { params: { path: { job_id: last.id } }, signal }))).result ?? null : null;
+    const { items: [last] } = await ok(api.GET("/v1/jobs", { params: { query: { kind: "package", subject_id: plan.id, state: "done", limit: 1 } }, signal }));
+    return last ? (await oneJob(last.id, "package", signal)).result : null;
   }, [plan.id, plan.version, turn]);
   const submit = async () => {
     const body = bodyOf(form.values, schema.data ?? undefined);

@@ -120,7 +120,7 @@ function RulesForm({ alignment, from, schema, start, profile }) {
       <${PlanView} profile=${profile} things=${things} pointedId=${pointed} onPoint=${setPointed} onChoose=${setPointed} note=${t("plan.preview_on_map")} />
     </section>
     <section class="card step" aria-labelledby="step-make"><h2 id="step-make">${t("new.make")}</h2>
-      ${job ? html`<${JobProgress} id=${job} onDone=${() => attemptPlan(job)} />` : html`
+      ${job ? html`<${JobProgress} id=${job} onDone=${(/** @type {import("../api/follow_job.js").Job} */ done) => navigate(`/plans/${done.subject_id}`)} />` : html`
         <${FormFrame} form=${named} onSubmit=${submit} button=${t("new.make_button")}>
           <div class="group"><${TextField} form=${named} path="name" label=${t("new.name")} hint=${t("new.name_hint")} required /></div>
         </${FormFrame}>`}
@@ -151,12 +151,6 @@ function RulesFile({ rules, onRules }) {
     </div>
     <${ProblemBox} error=${error} />
   `;
-}
-
-/** @param {string} job */
-async function attemptPlan(job) {
-  const done = await ok(api.GET("/v1/plan-jobs/{job_id}", { params: { path: { job_id: job } } }));
-  if (done.plan_id) navigate(`/plans/${done.plan_id}`);
 }
 
 /** @param {Record<string, string>} errors @param {string} name */

@@ -27,8 +27,8 @@ const MORE = ["seed", "cameras", "speed_share", "lost_share", "clearance_m", "su
  */
 export function useUnfinished(plan, kind) {
   const found = useLoad(async (signal) => {
-    const { items } = await ok(api.GET("/v1/plan-jobs", { params: { query: { plan_id: plan.id, limit: 50 } }, signal }));
-    return items.find((job) => job.kind === kind && ["queued", "running"].includes(job.state))?.id ?? "";
+    const { items } = await ok(api.GET("/v1/jobs", { params: { query: { kind, subject_id: plan.id, limit: 50 } }, signal }));
+    return items.find((job) => ["queued", "running"].includes(job.state))?.id ?? "";
   }, [plan.id]);
   const [started, setStarted] = useState("");
   return { job: started || found.data || "", start: setStarted, loading: found.loading };

@@ -55,10 +55,7 @@ function RulesForm({ plan, schema, onChanged, onPreview }) {
     notify(t("rules.variant_made", { name: made.name }));
     return navigate(`/plans/compare?ids=${plan.id},${made.id}`);
   };
-  const made = async () => {
-    const done = await ok(api.GET("/v1/plan-jobs/{job_id}", { params: { path: { job_id: job } } }));
-    if (done.plan_id) navigate(`/plans/compare?ids=${plan.id},${done.plan_id}`);
-  };
+  const made = (/** @type {import("../api/follow_job.js").Job} */ done) => navigate(`/plans/compare?ids=${plan.id},${done.subject_id}`);
   const { name: _name, ...wrong } = other.errors;
   const fields = { ...form, errors: { ...preview.errors, ...sent.errors, ...wrong } };
   return html`

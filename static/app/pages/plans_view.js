@@ -15,7 +15,7 @@ import { t, textOr } from "../texts/index.js";
 /**
  * @typedef {import("../api/schema.js").components["schemas"]["AlignmentProfile"]} Profile
  * @typedef {import("../api/schema.js").components["schemas"]["PlanDocument"]} Plan
- * @typedef {import("../api/schema.js").components["schemas"]["FindingDocument"]} Finding
+ * @typedef {import("../api/schema.js").components["schemas"]["PlanFinding"]} Finding
  * @typedef {import("../components/strip.js").Pointed} Pointed
  * @typedef {{ number: number, family: string, purpose?: string, code?: string, lane: string, chainage_m: number, offset_m: number, station?: string, lon_deg: number, lat_deg: number, status?: string, details?: string }} Marker
  * @typedef {{ id: string, lane: string, at_m: number, row: string, kind: "marker" | "check" | "event" | "weak", label: string, family?: string, status?: string, sign?: string, level?: string, lon_deg: number, lat_deg: number }} Thing

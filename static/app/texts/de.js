@@ -1012,6 +1012,7 @@ export default {
   "job.cancelled": "Abgebrochen",
   "job.done": "Fertig",
   "job.failed": "Fehlgeschlagen",
+  "job.none": "Diesen Auftrag gibt es nicht",
   "job.progress": "Fortschritt",
   "job.queued": "Wartet",
   "job.rate": "{rate} je Sekunde",

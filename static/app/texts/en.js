@@ -1012,6 +1012,7 @@ export default {
   "job.cancelled": "Cancelled",
   "job.done": "Done",
   "job.failed": "Failed",
+  "job.none": "There is no such job",
   "job.progress": "Progress",
   "job.queued": "Waiting",
   "job.rate": "{rate} per second",

@@ -78,7 +78,7 @@ def test_a_plan_is_packed_with_its_drawings_sheets_and_artwork(client: httpx.Cli
     assert queued.status_code == 202, queued.text
     job = finished(client, queued.headers["Location"])
     assert (job["kind"], job["state"], job["error"]) == ("package", "done", None)
-    assert job["steps_done"] == job["steps_total"] > 10
+    assert job["done"] == job["total"] > 10
     answer = client.get(f"{url}/package")
     assert (answer.status_code, answer.headers["content-type"]) == (200, "application/zip")
     assert len(answer.content) == job["result"]["size_bytes"]
@@ -91,7 +91,7 @@ def test_a_plan_is_packed_with_its_drawings_sheets_and_artwork(client: httpx.Cli
     for entry in manifest["files"]:
         content = archive.read(entry["name"])
         assert (len(content), hashlib.sha256(content).hexdigest()) == (entry["size"], entry["sha256"])
-    assert manifest["options"]["drawings"]["block"]["owner"] == "An Agency"
+    assert manifest["options"]["title_block"]["owner"] == "An Agency"
     names = archive.namelist()
     assert sum(name.startswith("artwork/plate-") for name in names) == plan["counts"]["plate"]
     assert {"drawings.pdf", "bill.csv", "stakeout.dxf", "artwork/quality.pdf"} <= set(names)
@@ -128,7 +128,7 @@ def test_an_interrupted_or_cancelled_package_leaves_nothing(
     monkeypatch.setattr(packages, "_processes", Watched(processes, stop))
     with pytest.raises(Unavailable):
         jobs.run_job(job["id"])
-    assert client.get(f"/v1/plan-jobs/{job['id']}").json()["state"] == "queued"
+    assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
 
     def cancel(count: int) -> None:
         if count == 3:
@@ -136,7 +136,7 @@ def test_an_interrupted_or_cancelled_package_leaves_nothing(
 
     monkeypatch.setattr(packages, "_processes", Watched(processes, cancel))
     jobs.run_job(job["id"])
-    assert client.get(f"/v1/plan-jobs/{job['id']}").json()["state"] == "cancelled"
+    assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "cancelled"
     refused(client.get(url), 404)
     assert blobs_of(server) == before
     monkeypatch.setattr(packages, "_processes", processes)
@@ -164,4 +164,4 @@ def test_bad_options_are_refused_and_no_job_is_queued(
     client: httpx.Client, plan: dict[str, Any], wanted: dict[str, Any], field: str
 ) -> None:
     refused(client.post(f"/v1/plans/{plan['id']}/package", json=wanted), 422, field=field)
-    assert client.get("/v1/plan-jobs").json()["items"] == []
+    assert client.get("/v1/jobs").json()["items"] == []

@@ -35,11 +35,11 @@ def test_a_plan_is_made_by_a_job_and_is_the_same_as_an_immediate_one(
     client: httpx.Client, body: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queued = client.post("/v1/plans", json=body, headers=LATER | {"Idempotency-Key": "made"})
-    assert (queued.status_code, queued.json()["plan_id"], queued.json()["kind"]) == (202, None, "plan")
+    assert (queued.status_code, queued.json()["subject_id"], queued.json()["kind"]) == (202, None, "plan")
     job = finished(client, queued.headers["Location"])
     assert (job["state"], job["result"]) == ("done", {"plan_version": 1})
-    plan = client.get(job["links"]["plan"]).json()
-    assert (plan["id"], plan["name"], plan["status"]) == (job["plan_id"], body["name"], "checked")
+    plan = client.get(job["links"]["result"]).json()
+    assert (plan["id"], plan["name"], plan["status"]) == (job["subject_id"], body["name"], "checked")
     for headers in (LATER, {}):  # the first response, whatever is preferred
         again = client.post("/v1/plans", json=body, headers=headers | {"Idempotency-Key": "made"})
         assert (again.status_code, again.json()) == (202, queued.json())
@@ -96,7 +96,7 @@ def test_bad_input_is_refused_at_once_or_fails_the_job_and_no_plan_is_stored(
     refused(client.post("/v1/plans", json=nowhere, headers=LATER), 404, field="alignment_id")
     elsewhere = body | {"rules": {"version": 1, "plates": {}, "road": {"lanes": ["7"]}}}
     failed = finished(client, client.post("/v1/plans", json=elsewhere, headers=LATER).headers["Location"])
-    assert (failed["state"], failed["plan_id"], failed["error"]["field"]) == ("failed", None, "road.lanes")
+    assert (failed["state"], failed["subject_id"], failed["error"]["field"]) == ("failed", None, "road.lanes")
     assert client.get("/v1/plans").json()["items"] == []
 
 

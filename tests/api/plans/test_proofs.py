@@ -102,10 +102,10 @@ def test_a_checked_plan_is_proved_and_its_report_is_the_same_for_the_same_seed(
     queued = prove_plan(client, plan, **{"Idempotency-Key": "once"})
     assert queued.status_code == 202, queued.text
     assert queued.json()["kind"] == "proof"
-    assert queued.json()["plan_id"] == plan["id"]
+    assert queued.json()["subject_id"] == plan["id"]
     job = finished(client, queued.headers["Location"])
     assert (job["state"], job["error"]) == ("done", None)
-    assert (job["steps_done"], job["steps_total"], job["progress"]) == (3, 3, 1.0)
+    assert (job["done"], job["total"], job["progress"]) == (3, 3, 1.0)
     assert job["result"] == {"plan_version": 1, "outdated": False, "passed": True, "weak": 0, "wrong": 0}
     proved = client.get(url).json()
     assert (proved["status"], proved["version"]) == ("proved", 2)
@@ -129,7 +129,7 @@ def test_a_checked_plan_is_proved_and_its_report_is_the_same_for_the_same_seed(
     assert again["result"]["plan_version"] == 2
     assert client.get(f"{url}/proof").json() == report
     assert client.get(url).json()["status"] == "proved"
-    jobs = client.get("/v1/plan-jobs", params={"plan_id": plan["id"]}).json()["items"]
+    jobs = client.get("/v1/jobs", params={"subject_id": plan["id"]}).json()["items"]
     assert [one["id"] for one in jobs] == [again["id"], job["id"]]
     assert len(list(folder.rglob("*/*"))) == before + 2, "the files of the earlier proof are gone"
     changed = client.patch(url, json={"rules": PLATES}, headers={"If-Match": '"3"'}).json()
@@ -141,12 +141,12 @@ def test_a_checked_plan_is_proved_and_its_report_is_the_same_for_the_same_seed(
 def test_uploads_are_decoded_while_a_proof_runs(client: httpx.Client, plan: dict[str, Any]) -> None:
     long = TERMS | {"drives": 200}
     location = client.post(f"/v1/plans/{plan['id']}/proof", json=long, headers=FIRST).headers["Location"]
-    wait_until(lambda: client.get(location).json()["steps_done"], "the first unit")
+    wait_until(lambda: client.get(location).json()["done"], "the first unit")
     frame = {"content": png(corner_frame()), "headers": {"Content-Type": "image/png"}}
     for _ in range(2):
         assert client.post("/v1/decodes", **frame).status_code == 201
         job = client.get(location).json()
-        assert (job["state"], job["steps_total"]) == ("running", 200)
+        assert (job["state"], job["total"]) == ("running", 200)
     client.post(f"/v1/jobs/{location.rpartition('/')[2]}/cancel")
     assert finished(client, location)["state"] == "cancelled"
 
@@ -170,8 +170,8 @@ def test_an_interrupted_proof_does_not_drive_finished_units_again(
         monkeypatch.setattr(proofs, "_processes", Watched(processes, stop_after_one))
         with pytest.raises(Unavailable):
             jobs.run_job(job["id"])
-    between = client.get(f"/v1/plan-jobs/{job['id']}").json()
-    assert (between["state"], between["steps_done"], between["attempts"]) == ("queued", 2, 0)
+    between = client.get(f"/v1/jobs/{job['id']}").json()
+    assert (between["state"], between["done"], between["attempts"]) == ("queued", 2, 0)
     refused(prove_plan(client, plan), 409, field="plan_id")
     assert client.get(f"/v1/plans/{plan['id']}").json()["status"] == "checked"
     rest = Watched(processes)
@@ -203,12 +203,12 @@ def test_a_proof_goes_on_after_a_restart_of_the_server(
 
         proofs._processes = Watched(proofs._processes, stop)
         location = prove_plan(client, plan).headers["Location"]
-        wait_until(lambda: client.get(location).json()["steps_done"] == 2, "two units")
+        wait_until(lambda: client.get(location).json()["done"] == 2, "two units")
     app = create_app(settings)
     app.state.use_cases.proofs._processes = rest = Watched(app.state.use_cases.proofs._processes)
     with LiveServer(app) as second, second.client() as client:
         job = finished(client, location)
-        assert (job["state"], job["steps_done"], rest.units) == ("done", 3, 1)
+        assert (job["state"], job["done"], rest.units) == ("done", 3, 1)
         assert client.get(f"/v1/plans/{plan['id']}").json()["status"] == "proved"
 
 
@@ -234,13 +234,13 @@ def test_a_cancelled_proof_stops_and_leaves_the_plan(
     watched = Watched(proofs._processes, cancel)
     monkeypatch.setattr(proofs, "_processes", watched)
     server.app.state.use_cases.jobs.run_job(job["id"])
-    ended = client.get(f"/v1/plan-jobs/{job['id']}").json()
+    ended = client.get(f"/v1/jobs/{job['id']}").json()
     assert (ended["state"], ended["result"], ended["cancel_requested"]) == ("cancelled", None, True)
     assert watched.units < 4
     assert client.get(f"/v1/plans/{plan['id']}").json() == plan
     assert client.post(f"/v1/jobs/{job['id']}/cancel").json()["state"] == "cancelled"
-    assert client.get(f"/v1/plan-jobs/{job['id']}").json() == ended
-    by_state = client.get("/v1/plan-jobs", params={"state": "cancelled"}).json()["items"]
+    assert client.get(f"/v1/jobs/{job['id']}").json() == ended
+    by_state = client.get("/v1/jobs", params={"state": "cancelled"}).json()["items"]
     assert [one["id"] for one in by_state] == [job["id"], queued["id"]]
 
 
@@ -262,7 +262,7 @@ def test_a_plan_that_was_changed_meanwhile_is_not_proved(
 
     monkeypatch.setattr(proofs, "_processes", Watched(proofs._processes, change))
     server.app.state.use_cases.jobs.run_job(job["id"])
-    ended = client.get(f"/v1/plan-jobs/{job['id']}").json()
+    ended = client.get(f"/v1/jobs/{job['id']}").json()
     assert (ended["state"], ended["result"]["outdated"], ended["result"]["plan_version"]) == ("done", True, 1)
     changed = client.get(url).json()
     assert (changed["status"], changed["proof"], changed["version"]) == ("checked", None, 2)
@@ -356,7 +356,7 @@ def test_bad_terms_are_refused_and_no_job_is_queued(
 ) -> None:
     headers = FIRST | {"Content-Type": "application/json"}
     refused(client.post(f"/v1/plans/{plan['id']}/proof", content=terms, headers=headers), status, field=field)
-    assert client.get("/v1/plan-jobs").json()["items"] == []
+    assert client.get("/v1/jobs").json()["items"] == []
 
 
 def test_too_many_units_and_nothing_to_drive_are_refused(client: httpx.Client, plan: dict[str, Any]) -> None:

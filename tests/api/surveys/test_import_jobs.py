@@ -66,30 +66,30 @@ def test_jobs_are_listed_newest_first(server: LiveServer, client: httpx.Client, 
     first = _finished_here(server, client, _send(client, _csv(), DEGREES, **LATER))
     ids = [first, *(_send(client, _csv(), DEGREES, **LATER).json()["id"] for _ in range(3))]
     _send(client, _csv(3), {**DEGREES, "dry_run": True})  # answered at once: no job
-    found, url, pages = [], "/v1/imports?limit=3", 0
+    found, url, pages = [], "/v1/jobs?kind=import&limit=3", 0
     while url:
         answer = client.get(url)
         assert answer.status_code == 200, answer.text
         found += answer.json()["items"]
         url, pages = answer.links.get("next", {}).get("url", ""), pages + 1
     assert ([job["id"] for job in found], pages) == (ids[::-1], 2)
-    assert all("report" not in job for job in found)
-    assert client.get(found[-1]["links"]["self"]).json()["report"]["stored"] == 8
+    assert all("result" not in job for job in found)
+    assert client.get(found[-1]["links"]["self"]).json()["result"]["stored"] == 8
     by_state = {
-        state: [job["id"] for job in client.get("/v1/imports", params={"state": state}).json()["items"]]
+        state: [job["id"] for job in client.get("/v1/jobs", params={"kind": "import", "state": state}).json()["items"]]
         for state in ("queued", "running", "done", "failed", "cancelled")
     }
     assert by_state == {"queued": ids[:0:-1], "running": [], "done": [first], "failed": [], "cancelled": []}
     for wrong in ({"state": "lost"}, {"limit": 0}, {"limit": 1001}, {"after": "x\u0000"}, {"before": ids[0]}):
-        assert client.get("/v1/imports", params=wrong).status_code in (400, 422)
+        assert client.get("/v1/jobs", params=wrong).status_code in (400, 422)
     with server.agency("imports of others") as other:
-        assert other.get("/v1/imports").json()["items"] == []
+        assert other.get("/v1/jobs").json()["items"] == []
 
 
 def _finished_here(server: LiveServer, client: httpx.Client, answer: httpx.Response) -> str:
     import_id: str = answer.json()["id"]
     server.app.state.use_cases.jobs.run_job(import_id)
-    assert client.get(f"/v1/imports/{import_id}").json()["state"] == "done"
+    assert client.get(f"/v1/jobs/{import_id}").json()["state"] == "done"
     return import_id
 
 
@@ -100,13 +100,13 @@ def test_one_that_waits_never_starts(server: LiveServer, client: httpx.Client, w
         assert _cancel(other, job["id"]).status_code == 404
     cancelled = _cancel(client, job["id"])
     assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
-    ended = client.get(f"/v1/imports/{job['id']}").json()
+    ended = client.get(f"/v1/jobs/{job['id']}").json()
     assert (ended["state"], ended["finished_at"] is None) == ("cancelled", False)
     server.app.state.use_cases.jobs.run_job(job["id"])
     assert _markers(client) == []
     assert _cancel(client, job["id"]).json()["state"] == "cancelled"
-    assert client.get(f"/v1/imports/{job['id']}").json() == ended
-    assert client.get("/v1/imports?state=cancelled").json()["items"][0]["id"] == job["id"]
+    assert client.get(f"/v1/jobs/{job['id']}").json() == ended
+    assert client.get("/v1/jobs?state=cancelled").json()["items"][0]["id"] == job["id"]
 
 
 def test_one_that_runs_stops_before_it_stores(
@@ -125,12 +125,12 @@ def test_one_that_runs_stops_before_it_stores(
     server.app.state.use_cases.jobs.run_job(job["id"])
     assert (asked[0].status_code, asked[0].json()["state"]) == (200, "running")
     assert asked[0].json()["cancel_requested"]
-    ended = client.get(f"/v1/imports/{job['id']}").json()
-    assert (ended["state"], ended["report"], ended["error"]) == ("cancelled", None, None)
+    ended = client.get(f"/v1/jobs/{job['id']}").json()
+    assert (ended["state"], ended["result"], ended["error"]) == ("cancelled", None, None)
     assert _markers(client) == []
     monkeypatch.undo()
     again = _finished(client, _send(client, _csv(), DEGREES, **LATER))
-    assert again["report"]["stored"] == 8
+    assert again["result"]["stored"] == 8
 
 
 def test_one_that_stores_says_that_it_is_too_late(
@@ -149,8 +149,8 @@ def test_one_that_stores_says_that_it_is_too_late(
     refused(asked[0], 409, "conflict", field="job_id")
     assert asked[0].json()["detail"] == "the import is storing already"
     assert (asked[1].status_code, asked[1].json()["state"]) == (200, "done")
-    ended = client.get(f"/v1/imports/{job['id']}").json()
-    assert (ended["state"], ended["cancel_requested"], ended["report"]["stored"]) == ("done", False, 8)
+    ended = client.get(f"/v1/jobs/{job['id']}").json()
+    assert (ended["state"], ended["cancel_requested"], ended["result"]["stored"]) == ("done", False, 8)
 
 
 def test_one_that_was_storing_when_the_server_stopped_goes_on(
@@ -167,9 +167,9 @@ def test_one_that_was_storing_when_the_server_stopped_goes_on(
     with pytest.raises(Unavailable):
         server.app.state.use_cases.jobs.run_job(job["id"])
     assert _markers(client) == []
-    assert client.get(f"/v1/imports/{job['id']}").json()["state"] == "queued"
+    assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
     assert _cancel(client, job["id"]).status_code == 409
     assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 409
     monkeypatch.setattr(imports._Import, "store", store)
     server.app.state.use_cases.jobs.run_job(job["id"])
-    assert client.get(f"/v1/imports/{job['id']}").json()["report"]["stored"] == 8
+    assert client.get(f"/v1/jobs/{job['id']}").json()["result"]["stored"] == 8

@@ -346,7 +346,7 @@ def _finished(client: httpx.Client, answer: httpx.Response) -> dict[str, Any]:
 def test_an_import_can_be_a_job(server: LiveServer, client: httpx.Client) -> None:
     later = {"Prefer": "respond-async", "Idempotency-Key": "once"}
     job = _finished(client, _send(client, _csv(), DEGREES, **later))
-    assert (job["state"], job["progress"], job["error"], job["report"]["stored"]) == ("done", 1.0, None, 8)
+    assert (job["state"], job["progress"], job["error"], job["result"]["stored"]) == ("done", 1.0, None, 8)
     again = _send(client, _csv(), DEGREES, **later)
     assert (again.status_code, again.json()["id"]) == (202, job["id"])
     assert again.headers["idempotency-replayed"] == "true"
@@ -354,25 +354,25 @@ def test_an_import_can_be_a_job(server: LiveServer, client: httpx.Client) -> Non
     versions = client.get(f"/v1/markers/{_markers(client)[0]['id']}/versions").json()["items"]
     assert [version["who"] for version in versions] == [versions[0]["who"]]
     refused = _finished(client, _send(client, _csv(), DEGREES, Prefer="respond-async"))
-    assert (refused["state"], refused["report"]["outcome"]) == ("done", "refused")
-    assert refused["report"]["counts"]["file_already_imported"] == 1
+    assert (refused["state"], refused["result"]["outcome"]) == ("done", "refused")
+    assert refused["result"]["counts"]["file_already_imported"] == 1
     failed = _finished(client, _send(client, b"\x00\x01", DEGREES, Prefer="respond-async"))
-    assert (failed["state"], failed["report"]) == ("failed", None)
+    assert (failed["state"], failed["result"]) == ("failed", None)
     assert failed["error"]["field"] == "file"
     assert client.get("/v1/decodes").json()["items"] == []
     assert client.get(f"/v1/decodes/{job['id']}").status_code == 404
     with server.agency("imports of another") as other:
-        assert other.get(f"/v1/imports/{job['id']}").status_code == 404
+        assert other.get(f"/v1/jobs/{job['id']}").status_code == 404
 
 
 @pytest.mark.slow
 def test_a_large_file_becomes_a_job_and_runs_once(server: LiveServer, client: httpx.Client) -> None:
     blank = b"\n" * (8 * 2**20)  # empty lines count for nothing but bytes
     job = _finished(client, _send(client, _csv(20) + blank, DEGREES))
-    assert job["report"]["stored"] == 20
+    assert job["result"]["stored"] == 20
     jobs = server.app.state.use_cases.jobs
     jobs.run_job(job["id"])  # once more, as after a crash
-    assert client.get(f"/v1/imports/{job['id']}").json() == job
+    assert client.get(f"/v1/jobs/{job['id']}").json() == job
     assert len(_markers(client)) == 20
 
 

@@ -11,12 +11,12 @@ from pyproj import Geod
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import BoundaryStyle
-from app.formats.alignments.read import RegisteredRoad, RoadLanes, RoadStation, read_alignment, write_registered_road
+from app.formats.alignments.read import RegisteredRoad, RoadLanes, read_alignment, write_registered_road
 from app.geodesy import LocalizationGrade
 from app.planning.alignment import Alignment, AlignmentDeclaration
 from app.planning.build_alignment import build_alignment
 from app.roads.axis import Axis
-from app.roads.lane_line import cut_edges
+from app.roads.lane_line import CalibrationPoint, cut_edges
 
 GEOD = Geod(ellps="WGS84")
 
@@ -82,9 +82,9 @@ def test_a_road_of_one_direction_has_its_axis_in_the_middle() -> None:
 
 def test_stations_are_the_measures_of_the_road() -> None:
     stations = [
-        RoadStation(part=0, chainage_m=100.0, measure_m=1100.0),
-        RoadStation(part=0, chainage_m=600.0, measure_m=1602.0),
-        RoadStation(part=0, chainage_m=900.0, measure_m=1902.0, ahead_m=5000.0),
+        CalibrationPoint(part=0, chainage_m=100.0, measure_m=1100.0),
+        CalibrationPoint(part=0, chainage_m=600.0, measure_m=1602.0),
+        CalibrationPoint(part=0, chainage_m=900.0, measure_m=1902.0, ahead_m=5000.0),
     ]
     built = read(road(calibration=stations))
     shown = [built.displayed_station_m(at) for at in (0.0, 100.0, 600.0, 700.0, 900.0, 1000.0)]

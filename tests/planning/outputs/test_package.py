@@ -16,8 +16,7 @@ from app.decoders.plate.reader import decode_plates
 from app.encoders.packer import file_entry
 from app.encoders.plate import ArtworkFormat
 from app.errors import InvalidParameter, ProofFailed
-from app.planning.outputs.package import OutputOptions, Package, PackageOptions, PartKind, plan_files
-from app.planning.outputs.strip_map import DrawingOptions
+from app.planning.outputs.package import Package, PackageOptions, PartKind, plan_files
 from app.planning.plan import PlannedTag
 from tests.planning.outputs.made import ALL, full_plan, plan_of, two_lanes
 
@@ -95,10 +94,10 @@ def test_a_plate_that_reads_otherwise_is_not_packed(package: Package) -> None:
 
 def test_options_that_do_not_fit_are_refused(package: Package) -> None:
     for options in (
-        OutputOptions(drawings=DrawingOptions(scale=300)),
-        OutputOptions(crs="EPSG:1"),
-        OutputOptions(unit="ell"),
+        PackageOptions(scale=300),
+        PackageOptions(crs="EPSG:1"),
+        PackageOptions(unit="ell"),  # type: ignore[arg-type]
     ):
         with pytest.raises(InvalidParameter):
-            Package(package.plan, PackageOptions(options)).check()
+            Package(package.plan, options).check()
     package.check()

@@ -17,7 +17,7 @@ from app.errors import InvalidParameter
 from app.formats.alignments.geometry import StationEquation
 from app.planning.outputs.drawing_sheet import PAGE_MM, TitleBlock
 from app.planning.outputs.strip_layout import ROW_MM, SCALES, STRIP_MM, Strip, cut_strips
-from app.planning.outputs.strip_map import NOT_SURVEYED, DrawingOptions, Drawings
+from app.planning.outputs.strip_map import NOT_SURVEYED, Drawings
 from app.planning.plan import Plan
 from tests.machine import require_tool
 from tests.planning.outputs.made import ALL, full_plan, plan_of
@@ -33,7 +33,7 @@ def texts(data: bytes, tmp_path: Path) -> list[str]:
 
 
 def drawn(plan: Plan, **options: Any) -> bytes:
-    drawings = Drawings(plan, DrawingOptions(**options))
+    drawings = Drawings(plan, **options)
     assert drawings.names == ("drawings.pdf",)
     return drawings.write("drawings.pdf")
 
@@ -167,7 +167,7 @@ def test_the_same_plan_gives_the_same_bytes() -> None:
 
 def test_many_sheets_become_several_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("app.planning.outputs.strip_map.MAX_SHEETS", 2)
-    drawings = Drawings(plan_of(road(straight(1500)), plates={}), DrawingOptions(scale=250))
+    drawings = Drawings(plan_of(road(straight(1500)), plates={}), scale=250)
     assert drawings.names == ("drawings-1.pdf", "drawings-2.pdf", "drawings-3.pdf")
     pages = [page for name in drawings.names for page in texts(drawings.write(name), tmp_path)]
     assert [f"{k} / {len(pages)}" in page for k, page in enumerate(pages, 1)] == [True] * len(pages)
@@ -178,7 +178,7 @@ def test_many_sheets_become_several_files(monkeypatch: pytest.MonkeyPatch, tmp_p
 def test_unusable_scales_are_refused(scale: int, part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.planning.outputs.strip_layout.MAX_STRIPS", 3)
     with pytest.raises(InvalidParameter) as raised:
-        Drawings(full_plan(), DrawingOptions(scale=scale))
+        Drawings(full_plan(), scale=scale)
     assert raised.value.field == "scale"
     assert part in str(raised.value.limit)
     assert raised.value.cure

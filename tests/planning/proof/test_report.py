@@ -55,5 +55,5 @@ def test_gaps_reach_from_the_lanes_start_to_its_end(plates: Plan) -> None:
 
 def test_wrong_readings_are_counted_with_their_marker(plates: Plan) -> None:
     report = summarize(plates, ProofTerms(), [unit(0, passed(1, 2), wrong=(WrongReading(marker=1, text="99"),))])
-    assert report.wrong == ((0, 1, "99"),)
+    assert report.wrong == ({"drive": 0, "marker": 1, "text": "99"},)
     assert report.markers[0].wrong == report.drives[0].wrong == 1

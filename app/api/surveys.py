@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, idempotency_of, read_declaration
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_case
+from app.api.http.dependencies import Caller, Idempotency, Number, Text, use_case
 from app.api.http.permissions import READERS, SURVEYORS
 from app.api.http.problems import FieldError, Problem, problem_responses, report_problem
 from app.api.http.responses import (
@@ -21,27 +21,29 @@ from app.api.http.responses import (
     created_response,
     document_response,
     file_response,
-    json_response,
-    page_response,
     wants_job,
 )
 from app.api.http.routes import Router
 from app.api.jobs import queued_job
 from app.api.markers.searches import Filtered, check_measures
-from app.api.surveys.schemas import DECLARATION_EXAMPLE, DeclarationIn
 from app.errors import InvalidParameter, UnreadableUpload
 from app.families import FamilyName
 from app.families.documents import StrictModel
 from app.markers.reading import Status
-from app.registry.jobs import JobState
 from app.services.idempotency import IdempotencyKey
 from app.services.markers.searches import checked_box
-from app.services.progress import JobDocument
+from app.services.progress import ImportJob, OtherJob
 from app.services.request_work import counted_steps
 from app.services.surveys.exports import MAX_LEFT_OUT_IDS, STREAMED, SUFFIXES, WHOLE, ExportJobs, filter_of
 from app.services.surveys.exports import Exports as ExportsService
 from app.services.surveys.import_jobs import ImportJobs, takes_long
-from app.services.surveys.import_report import ImportInput, ImportJobDocument, ImportJobPage, ImportReport, import_input
+from app.services.surveys.import_report import (
+    DECLARATION_EXAMPLE,
+    DeclarationIn,
+    ImportInput,
+    ImportReport,
+    import_input,
+)
 from app.services.surveys.imports import Imports as ImportsService
 
 # === /v1/imports: surveys come in.
@@ -63,7 +65,6 @@ _BODY = form_body(
 @dataclass(frozen=True, slots=True)
 class _Asked:
     given: ImportInput
-    declared: dict[str, Any]
     idempotency: IdempotencyKey | None
     as_job: bool
 
@@ -95,10 +96,10 @@ async def get_asked(
         file = part.spooled
         if not file.size:
             raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
-        declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
+        declared = await read_declaration(DeclarationIn, text, "body", "declaration")
         as_job = wants_job(prefer) or takes_long(file)
         key = idempotency_of(request, idempotency_key, text, file)
-        yield _Asked(import_input(declared, file), declared, key, as_job)
+        yield _Asked(import_input(declared, file), key, as_job)
 
 
 Asked = Annotated[_Asked, Depends(get_asked)]
@@ -115,7 +116,7 @@ Jobs = Annotated[ImportJobs, use_case(lambda cases: cases.import_jobs)]
     responses={
         200: {"model": ImportReport, "description": "Checked; nothing was stored"},
         201: {"model": ImportReport, "description": "Stored"},
-        202: {"model": ImportJobDocument, "description": "Queued; Location leads to its progress and its report"},
+        202: {"model": ImportJob, "description": "Queued; Location leads to its progress and its report"},
         **problem_responses(409, 415, refused=RefusedImport),
     },
 )
@@ -126,13 +127,10 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
 
     With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
     nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one that is sent with
-    `Prefer: respond-async`: 202, the report comes at Location.
+    `Prefer: respond-async`: 202, and the job at Location has the report as its result.
     """
     if asked.as_job:
-        document, replayed = jobs.submit(caller, asked.declared, asked.given.file, asked.idempotency)
-        response = created_response(document, replayed, path="/v1/imports", status=202)
-        response.headers["Retry-After"] = "1"
-        return response
+        return queued_job(*jobs.submit(caller, asked.given, asked.idempotency))
     try:
         report, replayed = imports.run(caller, asked.given, asked.idempotency)
     except InvalidParameter as error:
@@ -142,32 +140,6 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
     if report["outcome"] == "refused":
         return _refused(request, report)
     return created_response(report, replayed, status=200 if report["dry_run"] else 201)
-
-
-@import_router.get("", SURVEYORS, responses=document_response(ImportJobPage))
-def list_imports(
-    request: Request,
-    caller: Caller,
-    jobs: Jobs,
-    state: JobState | None = None,
-    limit: PageSize = 100,
-    after: LastId = None,
-) -> Response:
-    """List the imports of an agency that are or were jobs.
-
-    Without their reports, newest first. Those that were answered at once are none.
-    """
-    page, last = jobs.page(caller, state=state, before=after, limit=limit)
-    return page_response(request, page, after=last)
-
-
-@import_router.get("/{import_id}", SURVEYORS, responses=document_response(ImportJobDocument, 404))
-def get_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
-    """Get an import that was queued.
-
-    Its state, and its report once it is done. A refused one is done too.
-    """
-    return json_response(jobs.get(caller, import_id))
 
 
 def _refused(request: Request, report: ImportReport) -> Response:
@@ -221,7 +193,7 @@ class ExportIn(StrictModel):
     "",
     READERS,
     status_code=202,
-    responses=document_response(JobDocument, status=202, description="Queued; Location leads to its progress"),
+    responses=document_response(OtherJob, status=202, description="Queued; Location leads to its progress"),
 )
 def post_export(
     wanted: ExportIn,

@@ -1,1 +1,0 @@
-"""Routes on imports and exports of markers."""
