@@ -573,23 +573,6 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
-    "/v1/audit/verifications/{verification_id}": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** Get a verification of the audit log */
-        get: operations["get_verification"];
-        put?: never;
-        post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
     "/v1/calibration-boards/board.{form}": {
         parameters: {
             query?: never;
@@ -1149,28 +1132,10 @@ export interface paths {
             path?: never;
             cookie?: never;
         };
-        /** List the imports of an agency that are or were jobs */
-        get: operations["list_imports"];
+        get?: never;
         put?: never;
         /** Import a survey */
         post: operations["post_import"];
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/imports/{import_id}": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** Get an import that was queued */
-        get: operations["get_import"];
-        put?: never;
-        post?: never;
         delete?: never;
         options?: never;
         head?: never;
@@ -1649,40 +1614,6 @@ export interface paths {
         };
         /** Get the settings of the web pages */
         get: operations["get_page_settings"];
-        put?: never;
-        post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/plan-jobs": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** List jobs about plans */
-        get: operations["list_plan_jobs"];
-        put?: never;
-        post?: never;
-        delete?: never;
-        options?: never;
-        head?: never;
-        patch?: never;
-        trace?: never;
-    };
-    "/v1/plan-jobs/{job_id}": {
-        parameters: {
-            query?: never;
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        /** Get a job about a plan */
-        get: operations["get_plan_job"];
         put?: never;
         post?: never;
         delete?: never;
@@ -2562,7 +2493,7 @@ export interface components {
             declaration: {
                 [key: string]: unknown;
             };
-            events: components["schemas"]["EventSummary"][];
+            events: components["schemas"]["RoadEvent"][];
             extent_deg: number[];
             format: string;
             id: string;
@@ -2620,6 +2551,7 @@ export interface components {
             geometry: components["schemas"]["GeoLineIn"];
         };
         ApprovalIn: {
+            /** @default null */
             note?: string | null;
             /** @enum {string} */
             outcome: "suspect" | "retired" | "resurvey" | "none";
@@ -2627,6 +2559,7 @@ export interface components {
         /** @enum {string} */
         ArtworkFormat: "svg" | "pdf" | "dxf" | "png";
         ArtworkIn: {
+            /** @default null */
             bbox?: number[] | null;
             /**
              * @default [
@@ -2639,10 +2572,13 @@ export interface components {
             heaters?: boolean;
             /** @default false */
             leds?: boolean;
+            /** @default null */
             marker_ids?: string[] | null;
             /** @default 150 */
             resolution_dpi?: number;
+            /** @default null */
             sheet?: components["schemas"]["SheetIn"] | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
         };
         AsBuiltDocument: {
@@ -2680,7 +2616,7 @@ export interface components {
             versions: number;
             who: string;
         };
-        AuditFaultDocument: {
+        AuditFault: {
             what: string;
             where: string;
         };
@@ -2706,11 +2642,17 @@ export interface components {
             kind: "pmtiles" | "raster";
             url: string;
         };
-        BatteryIn: {
+        Battery: {
+            /** @default 40 */
+            awake_ma?: number;
+            /** @default 0.01 */
+            awake_s?: number;
             /** @default 1000 */
             capacity_mah?: number;
             /** @default 0.8 */
             sleep_ma?: number;
+            /** @default null */
+            transmit_ma?: number | null;
             /** @default 0.8 */
             usable_share?: number;
         };
@@ -2860,29 +2802,19 @@ export interface components {
             /** @default null */
             width_px?: number | null;
         };
-        CameraPassDocument: {
+        CameraPass: {
             best_unit_px: number;
             blur_mm: number;
             blur_units: number;
             far_m: number | null;
-            frames: components["schemas"]["PassFrameDocument"][];
+            frames: components["schemas"]["PassFrame"][];
             listed_every: number;
             min_read_rate: number;
             near_m: number | null;
-            read_rates: components["schemas"]["PassRateDocument"][];
+            read_rates: components["schemas"]["PassRate"][];
             readable_frames_per_pass: number;
             speed_kmh: number;
             step_m: number;
-        };
-        CameraPassIn: {
-            camera?: components["schemas"]["CameraRules"];
-            code?: components["schemas"]["CodeIn"];
-            geometry?: components["schemas"]["GeometryIn"];
-            /** @default 0 */
-            left_m?: number;
-            position?: components["schemas"]["PositionIn"] | null;
-            /** @default 60 */
-            speed_kmh?: number;
         };
         CameraRules: {
             /** @default 23 */
@@ -2910,23 +2842,6 @@ export interface components {
             distortion: number[];
             fx_px: number;
             fy_px: number;
-        };
-        CameraViewIn: {
-            /** @default 4 */
-            ahead_m?: number;
-            camera?: components["schemas"]["CameraRules"];
-            code?: components["schemas"]["CodeIn"];
-            /**
-             * @default day
-             * @enum {string}
-             */
-            condition?: "day" | "night" | "rain" | "shade" | "wear" | "dirt";
-            geometry?: components["schemas"]["GeometryIn"];
-            /** @default 0 */
-            left_m?: number;
-            position?: components["schemas"]["PositionIn"] | null;
-            /** @default 60 */
-            speed_kmh?: number;
         };
         CanDeclaration: {
             /** @default null */
@@ -2988,11 +2903,11 @@ export interface components {
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
             position_warnings?: components["schemas"]["WarningDocument"][];
-            radio: components["schemas"]["RadioDocument"];
+            radio: components["schemas"]["RadioSettings-Output"];
             road: string | null;
             /** @enum {string} */
             side: "left" | "right" | "unknown";
-            speed_limit: components["schemas"]["SpeedLimitDocument"] | null;
+            speed_limit: components["schemas"]["SpeedLimit-Output"] | null;
             /** @enum {string} */
             status: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             /** Format: date-time */
@@ -3000,25 +2915,35 @@ export interface components {
             version: number;
         };
         CerpmIn: {
+            /** @default null */
             dev_eui?: string | null;
             /** @constant */
             family: "cerpm";
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             number?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position: components["schemas"]["PositionIn"];
-            radio?: components["schemas"]["RadioIn"];
+            radio?: components["schemas"]["RadioSettings-Input"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default unknown
              * @enum {string}
              */
             side?: "left" | "right" | "unknown";
-            speed_limit?: components["schemas"]["SpeedLimitIn"] | null;
+            /** @default null */
+            speed_limit?: components["schemas"]["SpeedLimit-Input"] | null;
             /**
              * @default planned
              * @enum {string}
@@ -3058,13 +2983,7 @@ export interface components {
             updated_at: string;
             version: number;
         };
-        CheckComparison: {
-            built: components["schemas"]["FindingDocument"] | null;
-            name: string;
-            planned: components["schemas"]["FindingDocument"] | null;
-            verdict_changed: boolean;
-        };
-        CheckDocument: {
+        Check: {
             figure: number;
             limit: number;
             name: string;
@@ -3075,13 +2994,19 @@ export interface components {
             source: string;
             unit: string;
         };
+        CheckComparison: {
+            built: components["schemas"]["PlanFinding"] | null;
+            name: string;
+            planned: components["schemas"]["PlanFinding"] | null;
+            verdict_changed: boolean;
+        };
         CheckFigure: {
             figure: number;
             limit: number;
             name: string;
             relation: string;
             unit: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
         ClockDocument: {
             clock: string;
@@ -3102,45 +3027,66 @@ export interface components {
         CodebookDocument: {
             /** Format: date-time */
             created_at: string;
-            design: components["schemas"]["DesignDocument"];
+            design: components["schemas"]["TagDesign-Output"];
             entries: components["schemas"]["EntryDocument"][];
             entry_count: number;
             figures: components["schemas"]["FiguresDocument"];
             id: string;
             name: string;
-            rules: components["schemas"]["RulesDocument"];
+            rules: components["schemas"]["CodebookRules-Output"];
             /** Format: date-time */
             updated_at: string;
             version: number;
         };
         CodebookDraftDocument: {
             codes: components["schemas"]["CodeDocument"][];
-            design: components["schemas"]["DesignDocument"];
+            design: components["schemas"]["TagDesign-Output"];
             figures: components["schemas"]["FiguresDocument"];
-            rules: components["schemas"]["RulesDocument"];
+            rules: components["schemas"]["CodebookRules-Output"];
         };
         CodebookDraftIn: {
-            design: components["schemas"]["DesignIn"];
-            rules?: components["schemas"]["RulesIn"];
+            design: components["schemas"]["TagDesign-Input"];
+            rules?: components["schemas"]["CodebookRules-Input"];
         };
         CodebookIn: {
-            design: components["schemas"]["DesignIn"];
-            meanings?: components["schemas"]["MeaningIn"][];
+            design: components["schemas"]["TagDesign-Input"];
+            meanings?: components["schemas"]["Meaning"][];
             name: string;
-            rules?: components["schemas"]["RulesIn"];
+            rules?: components["schemas"]["CodebookRules-Input"];
         };
         CodebookPage: {
             items: components["schemas"]["CodebookSummary"][];
         };
+        "CodebookRules-Input": {
+            /** @default 0.3 */
+            clearance_m?: number;
+            /** @default 0.001 */
+            confusion?: number;
+            odometer?: components["schemas"]["OdometerError-Input"];
+            /** @default 13.4 */
+            speed_m_s?: number;
+            /** @default false */
+            survive_missing?: boolean;
+            /** @default false */
+            wrong_way_safe?: boolean;
+        };
+        "CodebookRules-Output": {
+            clearance_m: number;
+            confusion: number;
+            odometer: components["schemas"]["OdometerError-Output"];
+            speed_m_s: number;
+            survive_missing: boolean;
+            wrong_way_safe: boolean;
+        };
         CodebookSummary: {
             /** Format: date-time */
             created_at: string;
-            design: components["schemas"]["DesignDocument"];
+            design: components["schemas"]["TagDesign-Output"];
             entry_count: number;
             figures: components["schemas"]["FiguresDocument"];
             id: string;
             name: string;
-            rules: components["schemas"]["RulesDocument"];
+            rules: components["schemas"]["CodebookRules-Output"];
             /** Format: date-time */
             updated_at: string;
             version: number;
@@ -3149,17 +3095,17 @@ export interface components {
             code: string;
             tuple: string;
         };
-        CodeIn: {
+        CodeInput: {
             /** @default false */
             allow_mismatched_digits?: boolean;
+            /** @default null */
             check_digits?: number | null;
+            /** @default null */
             digits?: string | null;
+            /** @default null */
             registry_number?: number | null;
-            /**
-             * @default id
-             * @enum {string}
-             */
-            scheme?: "id" | "position-robust" | "position-check" | "position";
+            /** @default id */
+            scheme?: components["schemas"]["PlateScheme"];
         };
         CollectionDocument: {
             crs: string[];
@@ -3191,7 +3137,7 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             currency: string;
-            findings: components["schemas"]["FindingDocument"][];
+            findings: components["schemas"]["PlanFinding"][];
             id: string;
             lane_length_m: number;
             left_out: components["schemas"]["LeftOut"][];
@@ -3207,7 +3153,7 @@ export interface components {
             uncommitted: number;
             /** Format: date-time */
             updated_at: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
             version: number;
         };
         ComparisonDocument: {
@@ -3226,10 +3172,12 @@ export interface components {
         CompleteIn: {
             etags: string[];
         };
+        /** @enum {string} */
+        Condition: "day" | "night" | "rain" | "shade" | "wear" | "dirt";
         Conformance: {
             conformsTo: string[];
         };
-        ControlPointIn: {
+        ControlPoint: {
             easting: number;
             /** @default null */
             local_easting?: number | null;
@@ -3278,7 +3226,12 @@ export interface components {
         };
         DeclarationIn: {
             /** @default null */
-            area_deg?: number[] | null;
+            area_deg?: [
+                number,
+                number,
+                number,
+                number
+            ] | null;
             /** @default null */
             check_digits?: number | null;
             columns?: {
@@ -3312,7 +3265,10 @@ export interface components {
             format?: ("csv" | "geojson" | "gpkg" | "shapefile" | "kml" | "kmz" | "gpx" | "landxml" | "jobxml" | "dxf" | "gsi") | null;
             geometry?: components["schemas"]["GeometryIn"];
             /** @default null */
-            height_range_m?: number[] | null;
+            height_range_m?: [
+                number,
+                number
+            ] | null;
             /** @default null */
             height_unit?: ("m" | "ft-us" | "ft-intl") | null;
             /** @default false */
@@ -3321,11 +3277,12 @@ export interface components {
             layer?: string | null;
             /** @default null */
             layout?: ("named" | "pnezd" | "penzd" | "nezd" | "enzd") | null;
+            /** @default [] */
             leave_out?: number[];
             /** @default 0 */
             list_rows?: number;
             /** @default null */
-            local_grid?: components["schemas"]["LocalGridIn"] | null;
+            local_grid?: components["schemas"]["LocalGrid"] | null;
             /**
              * @default code
              * @enum {string}
@@ -3342,20 +3299,17 @@ export interface components {
             reason?: string | null;
             /** @default null */
             road?: string | null;
-            /**
-             * @default id
-             * @enum {string}
-             */
-            scheme?: "id" | "position-robust" | "position-check" | "position";
+            /** @default id */
+            scheme?: components["schemas"]["PlateScheme"];
             /**
              * @default unknown
              * @enum {string}
              */
-            side?: "unknown" | "left" | "right";
+            side?: "left" | "right" | "unknown";
             /** @default null */
             sign?: components["schemas"]["SignIn"] | null;
             /** @default null */
-            speed_limit?: components["schemas"]["SpeedLimitIn"] | null;
+            speed_limit?: components["schemas"]["SpeedLimit-Input"] | null;
             /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
             survey?: components["schemas"]["SurveyIn"];
@@ -3532,20 +3486,7 @@ export interface components {
         DeliveryPage: {
             items: components["schemas"]["DeliveryDocument"][];
         };
-        DesignDocument: {
-            length_m: number;
-            magnets: number;
-            min_gap_m: number;
-            segment_m: number;
-        };
-        DesignIn: {
-            length_m: number;
-            magnets: number;
-            /** @default 0.5 */
-            min_gap_m?: number;
-            segment_m: number;
-        };
-        DetectedDocument: {
+        Detected: {
             evidence: string;
             value: string;
             what: string;
@@ -3555,23 +3496,12 @@ export interface components {
             tolerance_mm: number | null;
             value_mm: number;
         };
-        DistinguishableDocument: {
+        Distinguishable: {
             accuracy: number;
             codes: number;
             mean_accuracy: number;
             share: number;
             worst_accuracy: number;
-        };
-        DraftArtworkIn: {
-            code?: components["schemas"]["CodeIn"];
-            geometry?: components["schemas"]["GeometryIn"];
-            /** @default false */
-            heaters?: boolean;
-            /** @default false */
-            leds?: boolean;
-            position?: components["schemas"]["PositionIn"] | null;
-            /** @default 150 */
-            resolution_dpi?: number;
         };
         DraftCodeDocument: {
             bits: number;
@@ -3590,7 +3520,46 @@ export interface components {
             lat_deg: number;
             lon_deg: number;
         };
+        DraftToDraw: {
+            code?: components["schemas"]["CodeInput"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default false */
+            heaters?: boolean;
+            /** @default false */
+            leds?: boolean;
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+            /** @default 150 */
+            resolution_dpi?: number;
+        };
+        DraftToPass: {
+            camera?: components["schemas"]["CameraRules"];
+            code?: components["schemas"]["CodeInput"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default 0 */
+            left_m?: number;
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+            /** @default 60 */
+            speed_kmh?: number;
+        };
+        DraftToView: {
+            /** @default 4 */
+            ahead_m?: number;
+            camera?: components["schemas"]["CameraRules"];
+            code?: components["schemas"]["CodeInput"];
+            /** @default day */
+            condition?: components["schemas"]["Condition"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default 0 */
+            left_m?: number;
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+            /** @default 60 */
+            speed_kmh?: number;
+        };
         DriveDecode: {
+            /** @default null */
             clock?: string | null;
             /** @default 0.5 */
             clock_sigma_s?: number;
@@ -3634,26 +3603,19 @@ export interface components {
             self: string;
         };
         DriveMarker: {
-            /** @default null */
-            across_m?: number | null;
-            /** @default null */
-            along_m?: number | null;
+            across_m: number | null;
+            along_m: number | null;
             decode_id: string;
             detail: string | null;
-            /** @default null */
-            distance?: number | null;
+            distance: number | null;
             family: string;
-            /** @default null */
-            lat_deg?: number | null;
-            /** @default null */
-            lon_deg?: number | null;
+            lat_deg: number | null;
+            lon_deg: number | null;
             marker_id: string | null;
-            /** @default null */
-            number?: number | null;
+            number: number | null;
             place: number;
             reason: components["schemas"]["LeftOutReason"] | null;
-            /** @default null */
-            time?: string | null;
+            time: string | null;
             used: boolean;
         };
         DriveOptions: {
@@ -3703,8 +3665,7 @@ export interface components {
             path_worst_at_m: number | null;
             path_worst_m: number | null;
             read: number;
-            /** @default [] */
-            refusals?: string[];
+            refusals: string[];
             wrong: number;
         };
         DriveStatistics: {
@@ -3747,7 +3708,7 @@ export interface components {
             low: number;
             value: number;
         };
-        EvenRoadIn: {
+        EvenRoad: {
             /** @default 3.6 */
             lane_width_m?: number;
             /** @default 2 */
@@ -3765,14 +3726,10 @@ export interface components {
             kind: string;
             subject_id: string | null;
         };
+        /** @enum {string} */
+        EventKind: "stop_line" | "junction" | "crossing" | "arrow" | "speed_limit" | "curve";
         EventPage: {
             items: components["schemas"]["EventDocument"][];
-        };
-        EventSummary: {
-            chainage_m: number;
-            kind: string;
-            lane: string;
-            value: number | string | null;
         };
         ExplainedDocument: {
             field: string;
@@ -3782,14 +3739,21 @@ export interface components {
             value: string;
         };
         ExportIn: {
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             family?: ("plate" | "magnet" | "cerpm" | "fiducial") | null;
             /** @enum {string} */
             format: "csv" | "geojson" | "gpkg" | "shapefile" | "kml" | "landxml" | "dxf";
+            /** @default null */
             from_m?: number | null;
+            /** @default null */
             polygon?: string | null;
+            /** @default null */
             road?: string | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
+            /** @default null */
             to_m?: number | null;
         };
         ExtentDocument: {
@@ -3828,15 +3792,15 @@ export interface components {
             /** @constant */
             type: "FeatureCollection";
         };
+        FiducialCode: {
+            dictionary: string;
+            number: number;
+        };
         FiducialCodeDocument: {
             dictionary: string;
             number: number;
             scheme: string;
             text: string;
-        };
-        FiducialCodeIn: {
-            dictionary: string;
-            number: number;
         };
         FiducialDocument: {
             code: components["schemas"]["FiducialCodeDocument"];
@@ -3847,7 +3811,7 @@ export interface components {
              * @enum {string}
              */
             family: "fiducial";
-            geometry: components["schemas"]["FiducialGeometryDocument"];
+            geometry: components["schemas"]["FiducialGeometry"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -3862,34 +3826,37 @@ export interface components {
             updated_at: string;
             version: number;
         };
-        FiducialGeometryDocument: {
-            /** @enum {string} */
-            mounting: "upright" | "lying";
+        FiducialGeometry: {
+            mounting: components["schemas"]["Mounting"];
             quiet_mm: number;
             side_mm: number;
         };
         FiducialGeometryIn: {
-            /**
-             * @default upright
-             * @enum {string}
-             */
-            mounting?: "upright" | "lying";
+            /** @default upright */
+            mounting?: components["schemas"]["Mounting"];
             /** @default null */
             quiet_mm?: number | null;
             side_mm: number;
         };
         FiducialIn: {
-            code: components["schemas"]["FiducialCodeIn"];
+            code: components["schemas"]["FiducialCode"];
             /** @constant */
             family: "fiducial";
             geometry: components["schemas"]["FiducialGeometryIn"];
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position: components["schemas"]["PositionIn"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default planned
@@ -3927,23 +3894,9 @@ export interface components {
             capacity_is_exact: boolean;
             capacity_under_rules: number;
             coupled_capacity: number;
-            distinguishable: components["schemas"]["DistinguishableDocument"];
+            distinguishable: components["schemas"]["Distinguishable"];
             ideal_capacity: number;
             wrong_way_safe_capacity: number;
-        };
-        FindingDocument: {
-            figure: number;
-            lane: string | null;
-            lat_deg: number | null;
-            limit: number;
-            lon_deg: number | null;
-            name: string;
-            relation: string;
-            sentence: string;
-            source: string;
-            station_m: number | null;
-            unit: string;
-            verdict: string;
         };
         FixDocument: {
             covariance: number[][];
@@ -3985,11 +3938,11 @@ export interface components {
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
             position_warnings?: components["schemas"]["WarningDocument"][];
-            radio: components["schemas"]["RadioDocument"];
+            radio: components["schemas"]["RadioSettings-Output"];
             road: string | null;
             /** @enum {string} */
             side: "left" | "right" | "unknown";
-            speed_limit: components["schemas"]["SpeedLimitDocument"] | null;
+            speed_limit: components["schemas"]["SpeedLimit-Output"] | null;
             /** @enum {string} */
             status: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             /** Format: date-time */
@@ -4007,7 +3960,7 @@ export interface components {
              * @enum {string}
              */
             family: "fiducial";
-            geometry: components["schemas"]["FiducialGeometryDocument"];
+            geometry: components["schemas"]["FiducialGeometry"];
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
@@ -4036,7 +3989,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
-            layout: components["schemas"]["TagPlaceDocument"] | components["schemas"]["LinePlaceDocument"];
+            layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             measure_m: number | null;
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
@@ -4210,38 +4163,30 @@ export interface components {
             /** @enum {string} */
             polarity: "N" | "S";
         };
-        ImportJobDocument: {
+        ImportJob: {
             attempts: number;
             cancel_requested: boolean;
             /** Format: date-time */
             created_at: string;
+            dead_letter: boolean;
+            done: number | null;
             error: components["schemas"]["ErrorDocument"] | null;
             finished_at: string | null;
             id: string;
-            links: components["schemas"]["ImportJobLinks"];
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "import";
+            links: components["schemas"]["JobLinks"];
             progress: number;
-            report: components["schemas"]["ImportReport"] | null;
+            rate_per_s: number | null;
+            result: components["schemas"]["ImportReport"] | null;
+            started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
-        };
-        ImportJobLinks: {
-            self: string;
-        };
-        ImportJobPage: {
-            items: components["schemas"]["ImportJobSummary"][];
-        };
-        ImportJobSummary: {
-            attempts: number;
-            cancel_requested: boolean;
-            /** Format: date-time */
-            created_at: string;
-            error: components["schemas"]["ErrorDocument"] | null;
-            finished_at: string | null;
-            id: string;
-            links: components["schemas"]["ImportJobLinks"];
-            progress: number;
-            /** @enum {string} */
-            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
         };
         ImportReport: {
             accuracy: components["schemas"]["AccuracyDocument"];
@@ -4250,7 +4195,7 @@ export interface components {
                 [key: string]: number;
             };
             crs: string;
-            detected: components["schemas"]["DetectedDocument"][];
+            detected: components["schemas"]["Detected"][];
             dry_run: boolean;
             extent_deg: number[] | null;
             faults: components["schemas"]["FaultDocument"][];
@@ -4316,7 +4261,17 @@ export interface components {
             version: number | null;
             warnings: components["schemas"]["WarningDocument"][];
         };
-        JobDocument: {
+        /** @enum {string} */
+        JobKind: "decode" | "import" | "plan" | "proof" | "package" | "artwork" | "reprocess" | "export" | "drive" | "audit";
+        JobLinks: {
+            events: string;
+            result?: string;
+            self: string;
+        };
+        JobPage: {
+            items: components["schemas"]["JobSummary"][];
+        };
+        JobSummary: {
             attempts: number;
             cancel_requested: boolean;
             /** Format: date-time */
@@ -4333,17 +4288,8 @@ export interface components {
             started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
             total: number | null;
-        };
-        /** @enum {string} */
-        JobKind: "decode" | "import" | "plan" | "proof" | "package" | "artwork" | "reprocess" | "export" | "drive" | "audit";
-        JobLinks: {
-            events: string;
-            result?: string;
-            self: string;
-        };
-        JobPage: {
-            items: components["schemas"]["JobDocument"][];
         };
         JsonValue: unknown;
         KeyDocument: {
@@ -4360,6 +4306,7 @@ export interface components {
             valid: boolean;
         };
         KeyIn: {
+            /** @default null */
             expires_at?: string | null;
             label: string;
             scope: components["schemas"]["Scope"];
@@ -4392,19 +4339,33 @@ export interface components {
             type: "LineString";
         };
         LaneIn: {
+            /** @default null */
             check_points?: number | null;
+            /** @default null */
             crs?: string | null;
+            /** @default null */
             epoch?: number | null;
+            /** @default null */
             geometry?: components["schemas"]["LineStringIn"] | null;
+            /** @default null */
             height_m?: number | null;
+            /** @default null */
             horizontal_rmse_m?: number | null;
+            /** @default null */
             instrument?: string | null;
+            /** @default null */
             points_m?: number[][] | null;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             survey_file_sha256?: string | null;
+            /** @default null */
             survey_method?: string | null;
+            /** @default null */
             surveyor?: string | null;
+            /** @default null */
             vertical_datum?: string | null;
+            /** @default null */
             vertical_rmse_m?: number | null;
         };
         LaneInFrame: {
@@ -4460,8 +4421,7 @@ export interface components {
             chainage_m: number;
             family: string;
             lane: string;
-            /** @default null */
-            moved_m?: number | null;
+            moved_m: number | null;
             reason: string;
         };
         LeftOutEntryDocument: {
@@ -4492,9 +4452,10 @@ export interface components {
             /** @default 6 */
             spacing_m?: number;
             style: components["schemas"]["LineStyle"];
+            /** @default null */
             to_m?: number | null;
         };
-        LinePlaceDocument: {
+        LinePlace: {
             from_m: number;
             spacing_m: number;
             to_m: number | null;
@@ -4520,6 +4481,28 @@ export interface components {
             title?: string;
             type: string;
         };
+        LinkModel: {
+            /** @default 20 */
+            at_power_dbm?: number;
+            /** @default 2.0420201802690747 */
+            exponent?: number;
+            /** @default 4 */
+            fading_db?: number;
+            /** @default -108 */
+            near_dbm?: number;
+            /** @default 50 */
+            near_m?: number;
+        };
+        LocalGrid: {
+            control_points: components["schemas"]["ControlPoint"][];
+            /** @default 0.05 */
+            limit_m?: number;
+            /**
+             * @default fixed
+             * @enum {string}
+             */
+            scale?: "fixed" | "free";
+        };
         LocalGridDocument: {
             control_points: components["schemas"]["ControlResidual"][];
             limit_m: number;
@@ -4528,16 +4511,6 @@ export interface components {
             rotation_deg: number;
             scale: string;
             scale_ppm: number;
-        };
-        LocalGridIn: {
-            control_points: components["schemas"]["ControlPointIn"][];
-            /** @default 0.05 */
-            limit_m?: number;
-            /**
-             * @default fixed
-             * @enum {string}
-             */
-            scale?: "fixed" | "free";
         };
         /** @enum {string} */
         LocalizationGrade: "cm" | "dm" | "m" | "unfit";
@@ -4558,9 +4531,12 @@ export interface components {
             format: string;
             left_out: number;
         };
+        MadePlanResult: {
+            plan_version: number;
+        };
         MagnetDetailDocument: {
             bill: components["schemas"]["BillDocument"];
-            checks: components["schemas"]["CheckDocument"][];
+            checks: components["schemas"]["Check"][];
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
@@ -4573,7 +4549,7 @@ export interface components {
             heading_rmse_deg: number | null;
             id: string;
             lane: components["schemas"]["LaneDocument"];
-            layout: components["schemas"]["TagPlaceDocument"] | components["schemas"]["LinePlaceDocument"];
+            layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             length_m: number;
             magnets: components["schemas"]["HoleDocument"][];
             measure_m: number | null;
@@ -4582,7 +4558,7 @@ export interface components {
             position: components["schemas"]["PositionDocument"];
             position_warnings?: components["schemas"]["WarningDocument"][];
             road: string | null;
-            site: components["schemas"]["SiteDocument"];
+            site: components["schemas"]["Site-Output"];
             /** @enum {string} */
             status: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
             /** Format: date-time */
@@ -4602,7 +4578,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
-            layout: components["schemas"]["TagPlaceDocument"] | components["schemas"]["LinePlaceDocument"];
+            layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             measure_m: number | null;
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
@@ -4617,36 +4593,36 @@ export interface components {
         MagnetIn: {
             /** @constant */
             family: "magnet";
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
             lane: components["schemas"]["LaneIn"];
+            /** @default null */
             line?: components["schemas"]["LineIn"] | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
-            site?: components["schemas"]["SiteIn"];
+            site?: components["schemas"]["Site-Input"];
             /**
              * @default planned
              * @enum {string}
              */
             status?: "planned" | "built" | "surveyed" | "active" | "suspect" | "retired";
+            /** @default null */
             tag?: components["schemas"]["TagIn"] | null;
         };
         MagnetReading: {
-            along_std_m?: number | null;
-            /** @default 0 */
-            clearance_cm?: number;
+            along_std_m: number | null;
+            clearance_cm: number;
             confidence: number;
             lateral_cm: number;
-            /**
-             * @default [
-             *       0,
-             *       0,
-             *       0
-             *     ]
-             */
-            moment_am2?: [
+            moment_am2: [
                 number,
                 number,
                 number
@@ -4654,10 +4630,8 @@ export interface components {
             odometer_m: number;
             phi_deg: components["schemas"]["Orientation"];
             polarity: components["schemas"]["Polarity"];
-            /** @default 0 */
-            relative_std_m?: number;
-            /** @default 0 */
-            snr?: number;
+            relative_std_m: number;
+            snr: number;
             t_s: number;
         };
         MaintenanceItem: {
@@ -4709,22 +4683,31 @@ export interface components {
             items: (components["schemas"]["FoundPlateDocument"] | components["schemas"]["FoundMagnetDocument"] | components["schemas"]["FoundCerpmDocument"] | components["schemas"]["FoundFiducialDocument"])[];
         };
         MarkerPatch: {
+            /** @default null */
             dev_eui?: string | null;
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position?: components["schemas"]["PositionIn"];
-            radio?: components["schemas"]["RadioIn"];
+            radio?: components["schemas"]["RadioSettings-Input"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default unknown
              * @enum {string}
              */
             side?: "left" | "right" | "unknown";
-            speed_limit?: components["schemas"]["SpeedLimitIn"] | null;
+            /** @default null */
+            speed_limit?: components["schemas"]["SpeedLimit-Input"] | null;
             /**
              * @default planned
              * @enum {string}
@@ -4774,14 +4757,10 @@ export interface components {
             unit: string;
             value: number | string;
         };
-        MeaningIn: {
-            kind: string;
-            value: number | string;
-        };
         /** @enum {string} */
         MeaningKind: "arrow" | "stop-line-ahead" | "speed-limit-kmh" | "speed-limit-mph" | "bend-left" | "bend-right" | "notice";
         MeaningsIn: {
-            meanings: components["schemas"]["MeaningIn"][];
+            meanings: components["schemas"]["Meaning"][];
         };
         MeasuredMarkers: {
             largest_change_m: number;
@@ -4797,6 +4776,8 @@ export interface components {
             permissions: string[];
             scope: components["schemas"]["Scope"];
         };
+        /** @enum {string} */
+        Mounting: "upright" | "lying";
         MultiLineStringIn: {
             coordinates: number[][][];
             /**
@@ -4822,6 +4803,7 @@ export interface components {
         };
         NewDrive: {
             decodes: components["schemas"]["DriveDecode"][];
+            /** @default null */
             name?: string | null;
             /**
              * @default {
@@ -4836,6 +4818,7 @@ export interface components {
              *     }
              */
             options?: components["schemas"]["DriveOptions"];
+            /** @default null */
             vehicle?: string | null;
         };
         NewFeature: {
@@ -4866,8 +4849,18 @@ export interface components {
         NewMarkerIn: components["schemas"]["PlateIn"] | components["schemas"]["MagnetIn"] | components["schemas"]["CerpmIn"] | components["schemas"]["FiducialIn"];
         NewVehicle: {
             name: string;
+            /** @default null */
             note?: string | null;
-            /** @default {} */
+            /**
+             * @default {
+             *       "camera": null,
+             *       "thermal": null,
+             *       "thermal_range": null,
+             *       "frames": null,
+             *       "trace": null,
+             *       "packets": null
+             *     }
+             */
             profile?: components["schemas"]["VehicleProfile"];
         };
         NewWebhookDocument: {
@@ -4930,12 +4923,7 @@ export interface components {
             marker_id: string;
             observations: number;
         };
-        OdometerDocument: {
-            drift: number;
-            quantum_m_s: number;
-            rate_hz: number;
-        };
-        OdometerIn: {
+        "OdometerError-Input": {
             /** @default 0.001 */
             drift?: number;
             /** @default 0.01 */
@@ -4943,13 +4931,69 @@ export interface components {
             /** @default 10 */
             rate_hz?: number;
         };
+        "OdometerError-Output": {
+            drift: number;
+            quantum_m_s: number;
+            rate_hz: number;
+        };
         /** @enum {integer} */
         Orientation: 0 | 90;
         Origin: {
             lat_deg: number;
             lon_deg: number;
         };
-        PackageIn: {
+        OtherJob: {
+            attempts: number;
+            cancel_requested: boolean;
+            /** Format: date-time */
+            created_at: string;
+            dead_letter: boolean;
+            done: number | null;
+            error: components["schemas"]["ErrorDocument"] | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "decode" | "drive" | "artwork" | "export" | "reprocess";
+            links: components["schemas"]["JobLinks"];
+            progress: number;
+            rate_per_s: number | null;
+            result: null;
+            started_at: string | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
+        };
+        PackageJob: {
+            attempts: number;
+            cancel_requested: boolean;
+            /** Format: date-time */
+            created_at: string;
+            dead_letter: boolean;
+            done: number | null;
+            error: components["schemas"]["ErrorDocument"] | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "package";
+            links: components["schemas"]["JobLinks"];
+            progress: number;
+            rate_per_s: number | null;
+            result: components["schemas"]["PackageResult"] | null;
+            started_at: string | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
+        };
+        PackageOptions: {
+            /** @default null */
             crs?: string | null;
             /**
              * @default [
@@ -4962,18 +5006,17 @@ export interface components {
             heaters?: boolean;
             /** @default false */
             leds?: boolean;
+            /** @default null */
             scale?: number | null;
-            /**
-             * @default {
-             *       "owner": "",
-             *       "number": "",
-             *       "date": "",
-             *       "creator": "",
-             *       "approver": ""
-             *     }
-             */
-            title_block?: components["schemas"]["TitleBlockIn"];
+            title_block?: components["schemas"]["TitleBlock"];
+            /** @default null */
             unit?: ("m" | "ft-us" | "ft-intl") | null;
+        };
+        PackageResult: {
+            files: number;
+            plan_version: number;
+            sha256: string;
+            size_bytes: number;
         };
         PacketReportDocument: {
             decode_ms: number;
@@ -5061,7 +5104,7 @@ export interface components {
             method: "s3-parts";
             size: number;
         };
-        PassFrameDocument: {
+        PassFrame: {
             ahead_m: number;
             blur_px: number;
             plate_height_px: number;
@@ -5069,7 +5112,7 @@ export interface components {
             read_probability: number;
             unit_px: number;
         };
-        PassRateDocument: {
+        PassRate: {
             condition: string;
             read_rate: number;
             will_be_read: boolean;
@@ -5095,10 +5138,6 @@ export interface components {
         PayloadFormat: "bin" | "hex" | "json";
         /** @enum {string} */
         PayloadText: "auto" | "hex" | "base64";
-        PlacedMarkersIn: {
-            chainage_m: number[];
-            offset_m: number[];
-        };
         PlaceDocument: {
             chainage_m: number;
             exact: boolean;
@@ -5128,7 +5167,7 @@ export interface components {
             /** Format: date-time */
             created_at: string;
             currency: string;
-            findings: components["schemas"]["FindingDocument"][];
+            findings: components["schemas"]["PlanFinding"][];
             id: string;
             lane_length_m: number;
             left_out: components["schemas"]["LeftOut"][];
@@ -5142,8 +5181,23 @@ export interface components {
             status: "draft" | "checked" | "proved" | "approved" | "committed" | "built" | "surveyed";
             /** Format: date-time */
             updated_at: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
             version: number;
+        };
+        PlanFinding: {
+            figure: number;
+            lane: string | null;
+            lat_deg: number | null;
+            limit: number;
+            lon_deg: number | null;
+            name: string;
+            /** @enum {string} */
+            relation: ">=" | "<=";
+            sentence: string;
+            source: string;
+            station_m: number | null;
+            unit: string;
+            verdict: components["schemas"]["Verdict"];
         };
         PlanIn: {
             alignment_id: string;
@@ -5152,59 +5206,30 @@ export interface components {
                 [key: string]: unknown;
             };
         };
-        PlanJobDocument: {
+        PlanJob: {
             attempts: number;
             cancel_requested: boolean;
             /** Format: date-time */
             created_at: string;
+            dead_letter: boolean;
+            done: number | null;
             error: components["schemas"]["ErrorDocument"] | null;
             finished_at: string | null;
             id: string;
-            /** @enum {string} */
-            kind: "plan" | "proof" | "package";
-            links: components["schemas"]["PlanJobLinks"];
-            plan_id: string | null;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "plan";
+            links: components["schemas"]["JobLinks"];
             progress: number;
-            result: components["schemas"]["PlanJobResult"] | null;
+            rate_per_s: number | null;
+            result: components["schemas"]["MadePlanResult"] | null;
+            started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
-            steps_done: number | null;
-            steps_total: number | null;
-        };
-        PlanJobLinks: {
-            plan?: string;
-            self: string;
-        };
-        PlanJobPage: {
-            items: components["schemas"]["PlanJobSummary"][];
-        };
-        PlanJobResult: {
-            files?: number;
-            outdated?: boolean;
-            passed?: boolean;
-            plan_version?: number;
-            sha256?: string;
-            size_bytes?: number;
-            weak?: number;
-            wrong?: number;
-        };
-        PlanJobSummary: {
-            attempts: number;
-            cancel_requested: boolean;
-            /** Format: date-time */
-            created_at: string;
-            error: components["schemas"]["ErrorDocument"] | null;
-            finished_at: string | null;
-            id: string;
-            /** @enum {string} */
-            kind: "plan" | "proof" | "package";
-            links: components["schemas"]["PlanJobLinks"];
-            plan_id: string | null;
-            progress: number;
-            /** @enum {string} */
-            state: "queued" | "running" | "done" | "failed" | "cancelled";
-            steps_done: number | null;
-            steps_total: number | null;
+            subject_id: string | null;
+            total: number | null;
         };
         PlanOverview: {
             alignment_id: string;
@@ -5225,15 +5250,18 @@ export interface components {
             status: "draft" | "checked" | "proved" | "approved" | "committed" | "built" | "surveyed";
             /** Format: date-time */
             updated_at: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
             version: number;
         };
         PlanPage: {
             items: components["schemas"]["PlanOverview"][];
         };
         PlanPatch: {
+            /** @default null */
             name?: string | null;
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             rules?: {
                 [key: string]: unknown;
             } | null;
@@ -5246,12 +5274,12 @@ export interface components {
                 [key: string]: number;
             };
             currency: string;
-            findings: components["schemas"]["FindingDocument"][];
+            findings: components["schemas"]["PlanFinding"][];
             lane_length_m: number;
             left_out: components["schemas"]["LeftOut"][];
             left_out_count: number;
             markers: components["schemas"]["PreviewedMarker"][];
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
         PlanPreviewIn: {
             alignment_id: string;
@@ -5310,6 +5338,12 @@ export interface components {
             updated_at: string;
             version: number;
         };
+        PlateDraft: {
+            code?: components["schemas"]["CodeInput"];
+            geometry?: components["schemas"]["GeometryIn"];
+            /** @default null */
+            position?: components["schemas"]["PositionIn"] | null;
+        };
         PlateDraftDocument: {
             code: components["schemas"]["DraftCodeDocument"];
             colours: components["schemas"]["PlateColourDocument"][];
@@ -5318,11 +5352,6 @@ export interface components {
             position: components["schemas"]["DraftPlaceDocument"] | null;
             sheet: components["schemas"]["PlateSheetDocument"];
             units: string[];
-        };
-        PlateDraftIn: {
-            code?: components["schemas"]["CodeIn"];
-            geometry?: components["schemas"]["GeometryIn"];
-            position?: components["schemas"]["PositionIn"] | null;
         };
         PlateGeometryDocument: {
             gap_mm: number;
@@ -5342,20 +5371,27 @@ export interface components {
             unused_correction: number;
         };
         PlateIn: {
-            code?: components["schemas"]["CodeIn"];
+            code?: components["schemas"]["CodeInput"];
             /**
              * @default plate
              * @constant
              */
             family?: "plate";
             geometry?: components["schemas"]["GeometryIn"];
+            /** @default null */
             heading_deg?: number | null;
+            /** @default null */
             heading_rmse_deg?: number | null;
+            /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
             measure_m?: number | null;
+            /** @default null */
             offset_m?: number | null;
             position: components["schemas"]["PositionIn"];
+            /** @default null */
             reason?: string | null;
+            /** @default null */
             road?: string | null;
             /**
              * @default planned
@@ -5400,6 +5436,8 @@ export interface components {
             scheme: string | null;
             width_px: number;
         };
+        /** @enum {string} */
+        PlateScheme: "position" | "position-check" | "position-robust" | "id";
         PlateSheetDocument: {
             height_mm: number;
             width_mm: number;
@@ -5456,21 +5494,37 @@ export interface components {
             vertical_rmse_m: number | null;
         };
         PositionIn: {
+            /** @default null */
             check_points?: number | null;
+            /** @default null */
             crs?: string | null;
+            /** @default null */
             easting_m?: number | null;
+            /** @default null */
             epoch?: number | null;
+            /** @default null */
             height_m?: number | null;
+            /** @default null */
             horizontal_rmse_m?: number | null;
+            /** @default null */
             instrument?: string | null;
+            /** @default null */
             lat_deg?: number | null;
+            /** @default null */
             lon_deg?: number | null;
+            /** @default null */
             northing_m?: number | null;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             survey_file_sha256?: string | null;
+            /** @default null */
             survey_method?: string | null;
+            /** @default null */
             surveyor?: string | null;
+            /** @default null */
             vertical_datum?: string | null;
+            /** @default null */
             vertical_rmse_m?: number | null;
         };
         PositionsIn: {
@@ -5493,9 +5547,10 @@ export interface components {
             purpose: string;
             station_m: number;
         };
-        PreviewIn: {
+        PreviewRule: {
             /** @default 3.4 */
             deceleration_m_s2?: number;
+            /** @default null */
             distance_m?: number | null;
             /** @default 2.5 */
             reaction_s?: number;
@@ -5504,11 +5559,8 @@ export interface components {
             /** @default 1 */
             check_digits?: number;
             digits: string;
-            /**
-             * @default id
-             * @enum {string}
-             */
-            scheme?: "id" | "position-robust" | "position-check" | "position";
+            /** @default id */
+            scheme?: components["schemas"]["PlateScheme"];
         };
         PrintedPlateDocument: {
             digits: string;
@@ -5527,12 +5579,13 @@ export interface components {
             letter: string;
             limited_by: string[];
             notes: string[];
-            parameters: components["schemas"]["PrintParameterDocument"][];
+            parameters: components["schemas"]["PrintParameter"][];
             photo: components["schemas"]["PrintPhotoDocument"];
             plate: components["schemas"]["PrintedPlateDocument"];
-            prediction: components["schemas"]["PrintPredictionDocument"];
+            prediction: components["schemas"]["PrintPrediction"];
             reading: components["schemas"]["PrintReadingDocument"];
             units: components["schemas"]["PrintGridDocument"];
+            view: components["schemas"]["PrintView"];
         };
         /** @enum {string} */
         PrintGradeFormat: "json" | "pdf";
@@ -5551,31 +5604,29 @@ export interface components {
             reflectance_margin: (number | null)[][];
             wrong: boolean[][];
         };
-        PrintParameterDocument: {
-            column: number | null;
+        PrintParameter: {
             cure: string | null;
             finding: string;
             grade: number;
             letter: string;
-            name: string;
-            row: number | null;
-            thresholds: components["schemas"]["ThresholdsDocument"];
+            name: components["schemas"]["PrintParameterName"];
+            thresholds: components["schemas"]["PrintThresholds"];
             unit: string;
+            unit_at: [
+                number,
+                number
+            ] | null;
             value: number;
         };
+        /** @enum {string} */
+        PrintParameterName: "symbol-contrast" | "modulation" | "reflectance-margin" | "axial-nonuniformity" | "grid-nonuniformity" | "print-growth" | "colour" | "damage" | "unused-error-correction" | "decode";
         PrintPhotoDocument: {
-            edge_mm: number;
-            focal_length_source: string;
             height_px: number;
-            light_ratio: number;
             sha256: string;
-            side_px: number;
             taken_at: string | null;
-            tilt_deg: number;
-            white_level: number;
             width_px: number;
         };
-        PrintPredictionDocument: {
+        PrintPrediction: {
             basis: string;
             camera: string;
             condition: string;
@@ -5593,6 +5644,26 @@ export interface components {
         PrintReadingDocument: {
             digits: string | null;
             outcome: string;
+        };
+        PrintThresholds: {
+            higher_is_better: boolean;
+            limits: [
+                number,
+                number,
+                number,
+                number
+            ];
+            source: string;
+            unit: string;
+        };
+        PrintView: {
+            edge_mm: number;
+            /** @enum {string} */
+            focal_length_source: "exif" | "assumed";
+            light_ratio: number;
+            side_px: number;
+            tilt_deg: number;
+            white_level: number;
         };
         Problem: {
             cure?: string;
@@ -5617,32 +5688,24 @@ export interface components {
         };
         ProfileEvent: {
             chainage_m: number;
-            kind: string;
+            kind: components["schemas"]["EventKind"];
             lane: string;
             lat_deg: number;
             lon_deg: number;
             value: number | string | null;
         };
         ProgramsIn: {
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             marker_ids?: string[] | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
             /** @default false */
             with_keys?: boolean;
         };
-        ProofDocument: {
-            complete: boolean;
-            drives: components["schemas"]["DriveResult"][];
-            format: string;
-            markers: components["schemas"]["MarkerProof"][];
-            note: string;
-            plan: string;
-            rates: components["schemas"]["ReadRate"][];
-            terms: components["schemas"]["ProofTermsDocument"];
-            weak: number[];
-            wrong: components["schemas"]["WrongReadingDocument"][];
-        };
         ProofIn: {
+            /** @default null */
             cameras?: string[] | null;
             /** @default 0.16 */
             clearance_m?: number;
@@ -5669,6 +5732,50 @@ export interface components {
             /** @default 0.9 */
             weak_below?: number;
         };
+        ProofJob: {
+            attempts: number;
+            cancel_requested: boolean;
+            /** Format: date-time */
+            created_at: string;
+            dead_letter: boolean;
+            done: number | null;
+            error: components["schemas"]["ErrorDocument"] | null;
+            finished_at: string | null;
+            id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "proof";
+            links: components["schemas"]["JobLinks"];
+            progress: number;
+            rate_per_s: number | null;
+            result: components["schemas"]["ProofResult"] | null;
+            started_at: string | null;
+            /** @enum {string} */
+            state: "queued" | "running" | "done" | "failed" | "cancelled";
+            subject_id: string | null;
+            total: number | null;
+        };
+        ProofReport: {
+            complete: boolean;
+            drives: components["schemas"]["DriveResult"][];
+            format: string;
+            markers: components["schemas"]["MarkerProof"][];
+            note: string;
+            plan: string;
+            rates: components["schemas"]["ReadRate"][];
+            terms: components["schemas"]["ProofTerms"];
+            weak: number[];
+            wrong: components["schemas"]["WrongInDrive"][];
+        };
+        ProofResult: {
+            outdated: boolean;
+            passed: boolean;
+            plan_version: number;
+            weak: number;
+            wrong: number;
+        };
         ProofSummary: {
             /** Format: date-time */
             at: string;
@@ -5676,13 +5783,13 @@ export interface components {
             markers: number;
             passed: boolean;
             rates: components["schemas"]["ReadRate"][];
-            terms: components["schemas"]["ProofTermsDocument"];
+            terms: components["schemas"]["ProofTerms"];
             units: number;
             weak: number;
             weak_markers: components["schemas"]["WeakMarker"][];
             wrong: number;
         };
-        ProofTermsDocument: {
+        ProofTerms: {
             cameras: string[] | null;
             clearance_m: number;
             conditions: string[];
@@ -5714,53 +5821,39 @@ export interface components {
             damage_reports: boolean;
             fields: ("code" | "agency" | "status" | "revision" | "road" | "measure")[];
         };
-        RadioCheckDocument: {
+        RadioCheck: {
             battery_days: number;
-            checks: components["schemas"]["RadioFindingDocument"][];
+            checks: components["schemas"]["RadioFinding"][];
             packet_success: number;
             preview_m: number;
             range_m: number;
             read_probability: number;
-            recommendation: components["schemas"]["RecommendationDocument"] | null;
-            road: components["schemas"]["RoadReceptionDocument"];
+            recommendation: components["schemas"]["Recommendation"] | null;
+            road: components["schemas"]["RoadReception"];
             time_on_air_s: number;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
         RadioCheckIn: {
-            battery?: components["schemas"]["BatteryIn"];
+            battery?: components["schemas"]["Battery"];
             /** @default 13.4 */
             design_speed_m_s?: number;
-            markers?: components["schemas"]["PlacedMarkersIn"] | null;
+            link?: components["schemas"]["LinkModel"];
+            /** @default null */
+            markers?: components["schemas"]["RoadMarkers"] | null;
             /** @default 365 */
             min_battery_days?: number;
             /** @default 0.99 */
             min_probability?: number;
-            preview?: components["schemas"]["PreviewIn"];
-            radio?: components["schemas"]["RadioIn"];
-            receiver?: components["schemas"]["ReceiverIn"];
+            preview?: components["schemas"]["PreviewRule"];
+            radio?: components["schemas"]["RadioSettings-Input"];
+            receiver?: components["schemas"]["Receiver"];
             /** @default false */
             recommend?: boolean;
             /** @default US915 */
             region?: components["schemas"]["Region"];
-            road?: components["schemas"]["EvenRoadIn"];
+            road?: components["schemas"]["EvenRoad"];
         };
-        RadioDocument: {
-            antenna_gain_dbi: number;
-            bandwidth_hz: number;
-            channels: number;
-            coding_rate: number;
-            crc: boolean;
-            explicit_header: boolean;
-            frequency_hz: number;
-            hopping: boolean;
-            interval_s: number;
-            jitter_share: number;
-            lorawan: boolean;
-            power_dbm: number;
-            preamble_symbols: number;
-            spreading_factor: number;
-        };
-        RadioFindingDocument: {
+        RadioFinding: {
             figure: number;
             limit: number;
             name: string;
@@ -5769,9 +5862,9 @@ export interface components {
             sentence: string;
             source: string;
             unit: string;
-            verdict: string;
+            verdict: components["schemas"]["Verdict"];
         };
-        RadioIn: {
+        "RadioSettings-Input": {
             /** @default 2.15 */
             antenna_gain_dbi?: number;
             /** @default 500000 */
@@ -5801,7 +5894,7 @@ export interface components {
             /** @default 7 */
             spreading_factor?: number;
         };
-        RadioSettingsDocument: {
+        "RadioSettings-Output": {
             antenna_gain_dbi: number;
             bandwidth_hz: number;
             channels: number;
@@ -5867,17 +5960,20 @@ export interface components {
             /** @constant */
             status: "received";
         };
-        ReceiverDeclaration: {
-            /** @default null */
-            antenna_height_m?: number | null;
-            /** @default null */
-            sensitivity_dbm?: number | null;
-        };
-        ReceiverIn: {
+        Receiver: {
             /** @default 6 */
             capture_db?: number | null;
             /** @default 1 */
             channels?: number;
+            /** @default false */
+            relocks?: boolean;
+            /** @default null */
+            sensitivity_dbm?: number | null;
+        };
+        ReceiverDeclaration: {
+            /** @default null */
+            antenna_height_m?: number | null;
+            /** @default null */
             sensitivity_dbm?: number | null;
         };
         ReceiverPositions: {
@@ -5894,9 +5990,9 @@ export interface components {
             stated_m: number;
             used: number;
         };
-        RecommendationDocument: {
+        Recommendation: {
             battery_days: number;
-            radio: components["schemas"]["RadioSettingsDocument"] | null;
+            radio: components["schemas"]["RadioSettings-Output"] | null;
             reaches: boolean;
             read_probability: number;
             receiver_channels: number;
@@ -5950,6 +6046,7 @@ export interface components {
             reason: string;
         };
         ReportApprovalIn: {
+            /** @default null */
             note?: string | null;
         };
         ReportContact: {
@@ -6003,12 +6100,19 @@ export interface components {
             who: string;
         };
         ReprocessingIn: {
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             decoder?: string | null;
+            /** @default null */
             kinds?: components["schemas"]["DecodeKind"][] | null;
+            /** @default null */
             older_than?: string | null;
+            /** @default null */
             since?: string | null;
+            /** @default null */
             until?: string | null;
+            /** @default null */
             vehicle_id?: string | null;
         };
         ReprocessingLinks: {
@@ -6062,6 +6166,12 @@ export interface components {
             updated_at: string;
             version: number;
         };
+        RoadEvent: {
+            chainage_m: number;
+            kind: components["schemas"]["EventKind"];
+            lane: string;
+            value: number | string | null;
+        };
         RoadGeometry: {
             coordinates: number[][] | number[][][];
             /** @enum {string} */
@@ -6069,15 +6179,19 @@ export interface components {
         };
         RoadIn: {
             calibration?: components["schemas"]["StationIn"][];
+            /** @default null */
             crs?: string | null;
             /** @default false */
             dry_run?: boolean;
+            /** @default null */
             epoch?: number | null;
             geometry: components["schemas"]["GeoLineIn"] | components["schemas"]["MultiLineStringIn"];
             /** @default true */
             measure_markers?: boolean;
             name: string;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             reason?: string | null;
         };
         RoadLanes: {
@@ -6115,19 +6229,29 @@ export interface components {
             sections: components["schemas"]["Section"][];
             version: number;
         };
+        RoadMarkers: {
+            chainage_m: number[];
+            offset_m: number[];
+        };
         RoadPage: {
             items: components["schemas"]["RoadSummary"][];
         };
         RoadPatch: {
+            /** @default null */
             calibration?: components["schemas"]["StationIn"][] | null;
+            /** @default null */
             crs?: string | null;
             /** @default false */
             dry_run?: boolean;
+            /** @default null */
             epoch?: number | null;
+            /** @default null */
             geometry?: (components["schemas"]["GeoLineIn"] | components["schemas"]["MultiLineStringIn"]) | null;
             /** @default true */
             measure_markers?: boolean;
+            /** @default null */
             realization?: string | null;
+            /** @default null */
             reason?: string | null;
         };
         RoadPlaced: {
@@ -6145,7 +6269,7 @@ export interface components {
             sections: components["schemas"]["Section"][];
             version: number;
         };
-        RoadReceptionDocument: {
+        RoadReception: {
             markers_in_range: number[];
             packet_success_mean: (number | null)[];
             packet_success_min: (number | null)[];
@@ -6180,6 +6304,7 @@ export interface components {
             items: components["schemas"]["RoadVersionDocument"][];
         };
         RotationIn: {
+            /** @default null */
             expires_at?: string | null;
             /** @default 86400 */
             overlap_s?: number;
@@ -6187,27 +6312,6 @@ export interface components {
         RssiProfile: {
             distance_m: number[];
             rssi_dbm: number[];
-        };
-        RulesDocument: {
-            clearance_m: number;
-            confusion: number;
-            odometer: components["schemas"]["OdometerDocument"];
-            speed_m_s: number;
-            survive_missing: boolean;
-            wrong_way_safe: boolean;
-        };
-        RulesIn: {
-            /** @default 0.3 */
-            clearance_m?: number;
-            /** @default 0.001 */
-            confusion?: number;
-            odometer?: components["schemas"]["OdometerIn"];
-            /** @default 13.4 */
-            speed_m_s?: number;
-            /** @default false */
-            survive_missing?: boolean;
-            /** @default false */
-            wrong_way_safe?: boolean;
         };
         RulesTextIn: {
             text: string;
@@ -6228,17 +6332,29 @@ export interface components {
         /** @enum {string} */
         Scope: "admin" | "planner" | "surveyor" | "viewer" | "vehicle" | "operator";
         SearchIn: {
+            /** @default null */
             along?: components["schemas"]["AlongIn"] | null;
+            /** @default null */
             bbox?: number[] | null;
+            /** @default null */
             code?: string | null;
+            /** @default null */
             family?: ("plate" | "magnet" | "cerpm" | "fiducial") | null;
+            /** @default null */
             from_m?: number | null;
+            /** @default null */
             near?: components["schemas"]["PlaceIn"] | null;
+            /** @default null */
             nearest?: number | null;
+            /** @default null */
             polygon?: (components["schemas"]["PolygonIn"] | components["schemas"]["MultiPolygonIn"]) | null;
+            /** @default null */
             radius_m?: number | null;
+            /** @default null */
             road?: string | null;
+            /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
+            /** @default null */
             to_m?: number | null;
         };
         Section: {
@@ -6331,22 +6447,16 @@ export interface components {
             scopes: string;
             token_url: string;
         };
-        SiteDocument: {
-            deceleration_m_s2: number;
-            design_speed_m_s: number | null;
-            reaction_s: number;
-            readable_clearance_m: number;
-            stop_line_chainage_m: number | null;
-            vehicles: string[];
-        };
-        SiteIn: {
+        "Site-Input": {
             /** @default 3.4 */
             deceleration_m_s2?: number;
+            /** @default null */
             design_speed_m_s?: number | null;
             /** @default 2.5 */
             reaction_s?: number;
             /** @default 0.3 */
             readable_clearance_m?: number;
+            /** @default null */
             stop_line_chainage_m?: number | null;
             /**
              * @default [
@@ -6356,18 +6466,25 @@ export interface components {
              */
             vehicles?: string[];
         };
+        "Site-Output": {
+            deceleration_m_s2: number;
+            design_speed_m_s: number | null;
+            reaction_s: number;
+            readable_clearance_m: number;
+            stop_line_chainage_m: number | null;
+            vehicles: string[];
+        };
         SpatialExtent: {
             bbox: number[][];
             crs: string;
         };
-        SpeedLimitDocument: {
-            /** @enum {string} */
-            unit: "km/h" | "mph";
-            value: number;
-        };
-        SpeedLimitIn: {
+        "SpeedLimit-Input": {
             /** @default km/h */
             unit?: components["schemas"]["SpeedUnit"];
+            value: number;
+        };
+        "SpeedLimit-Output": {
+            unit: components["schemas"]["SpeedUnit"];
             value: number;
         };
         /** @enum {string} */
@@ -6380,12 +6497,16 @@ export interface components {
             vertex: number | null;
         };
         StationIn: {
+            /** @default null */
             ahead_m?: number | null;
+            /** @default null */
             chainage_m?: number | null;
             measure_m: number;
             /** @default 0 */
             part?: number;
+            /** @default null */
             position?: number[] | null;
+            /** @default null */
             vertex?: number | null;
         };
         SteeringDocument: {
@@ -6422,6 +6543,19 @@ export interface components {
             row: number;
             /** @enum {string} */
             state: "good" | "warning" | "refused" | "left-out";
+        };
+        "TagDesign-Input": {
+            length_m: number;
+            magnets: number;
+            /** @default 0.5 */
+            min_gap_m?: number;
+            segment_m: number;
+        };
+        "TagDesign-Output": {
+            length_m: number;
+            magnets: number;
+            min_gap_m: number;
+            segment_m: number;
         };
         TagDocument: {
             confidence: number;
@@ -6469,9 +6603,12 @@ export interface components {
         };
         TagIn: {
             chainage_m: number;
+            /** @default null */
             code?: string | null;
+            /** @default null */
             codebook_id?: string | null;
-            meaning?: components["schemas"]["MeaningIn"] | null;
+            /** @default null */
+            meaning?: components["schemas"]["Meaning"] | null;
             /** @default 0 */
             offset_m?: number;
         };
@@ -6485,20 +6622,12 @@ export interface components {
             registered: boolean;
             status: string | null;
         };
-        TagPlaceDocument: {
+        TagPlace: {
             chainage_m: number;
             offset_m: number;
         };
         TemporalExtent: {
             interval: (string | null)[][];
-        };
-        ThresholdsDocument: {
-            A: number;
-            B: number;
-            C: number;
-            D: number;
-            higher_is_better: boolean;
-            source: string;
         };
         TileMatrix: {
             cellSize: number;
@@ -6538,7 +6667,7 @@ export interface components {
         };
         /** @enum {string} */
         TimeScale: "auto" | "unix-s" | "unix-ms" | "unix-us" | "unix-ns" | "gps-s" | "gps-ms";
-        TitleBlockIn: {
+        TitleBlock: {
             /** @default  */
             approver?: string;
             /** @default  */
@@ -6629,8 +6758,7 @@ export interface components {
             lost_s: number;
             part: string;
             sample: number;
-            /** @default 0 */
-            skipped_bytes?: number;
+            skipped_bytes: number;
             t_s: number;
         };
         TraceMotion: {
@@ -6643,29 +6771,20 @@ export interface components {
             clock_offsets_s?: {
                 [key: string]: number;
             };
-            /** @default 0 */
-            decode_ms?: number;
-            /** @default 0 */
-            driven_m?: number;
-            /** @default 0 */
-            duration_s?: number;
+            decode_ms: number;
+            driven_m: number;
+            duration_s: number;
             formats?: {
                 [key: string]: components["schemas"]["TraceFormat"];
             };
-            /** @default 0 */
-            gap_count?: number;
+            gap_count: number;
             gaps?: components["schemas"]["TraceGap"][];
-            /** @default 0 */
-            heading_coverage?: number;
+            heading_coverage: number;
             left_out?: components["schemas"]["LeftOutRows"][];
-            /** @default 0 */
-            load_ms?: number;
-            /** @default 0 */
-            rate_hz?: number;
-            /** @default 0 */
-            samples?: number;
-            /** @default 0 */
-            speed_coverage?: number;
+            load_ms: number;
+            rate_hz: number;
+            samples: number;
+            speed_coverage: number;
             warnings?: string[];
         };
         TraceSummary: {
@@ -6777,8 +6896,11 @@ export interface components {
         VehicleCamera: {
             /** @default 0 */
             azimuth_deg?: number;
+            /** @default null */
             calibration_id?: string | null;
+            /** @default null */
             cx_px?: number | null;
+            /** @default null */
             cy_px?: number | null;
             /** @default 23 */
             depression_deg?: number;
@@ -6786,11 +6908,15 @@ export interface components {
             distortion?: number[];
             /** @default 0 */
             forward_m?: number;
+            /** @default null */
             fx_px?: number | null;
+            /** @default null */
             fy_px?: number | null;
             /** @default 1.57 */
             height_m?: number;
+            /** @default null */
             height_px?: number | null;
+            /** @default null */
             horizontal_fov_deg?: number | null;
             /** @default 0 */
             left_m?: number;
@@ -6798,14 +6924,26 @@ export interface components {
             readout_s?: number;
             /** @default 0 */
             roll_deg?: number;
+            /** @default null */
             width_px?: number | null;
         };
         VehicleChange: {
             /** @default  */
             name?: string;
+            /** @default null */
             note?: string | null;
-            /** @default {} */
+            /**
+             * @default {
+             *       "camera": null,
+             *       "thermal": null,
+             *       "thermal_range": null,
+             *       "frames": null,
+             *       "trace": null,
+             *       "packets": null
+             *     }
+             */
             profile?: components["schemas"]["VehicleProfile"];
+            /** @default null */
             reason?: string | null;
             /**
              * @default active
@@ -6844,14 +6982,20 @@ export interface components {
             items: components["schemas"]["VehicleDocument"][];
         };
         VehicleProfile: {
+            /** @default null */
             camera?: components["schemas"]["VehicleCamera"] | null;
+            /** @default null */
             frames?: components["schemas"]["DeclaredFrames"] | null;
+            /** @default null */
             packets?: components["schemas"]["DeclaredPackets"] | null;
+            /** @default null */
             thermal?: boolean | null;
+            /** @default null */
             thermal_range?: [
                 number,
                 number
             ] | null;
+            /** @default null */
             trace?: components["schemas"]["DeclaredTrace"] | null;
         };
         VehicleTrackDocument: {
@@ -6886,24 +7030,40 @@ export interface components {
         VehicleVersionPage: {
             items: components["schemas"]["VehicleVersionDocument"][];
         };
-        VerificationDocument: {
+        /** @enum {string} */
+        Verdict: "ok" | "warn" | "fail";
+        VerificationInput: {
+            expected_head?: string | null;
+        };
+        VerificationJob: {
+            attempts: number;
+            cancel_requested: boolean;
             /** Format: date-time */
             created_at: string;
+            dead_letter: boolean;
+            done: number | null;
             error: components["schemas"]["ErrorDocument"] | null;
             finished_at: string | null;
             id: string;
+            /**
+             * @description discriminator enum property added by openapi-typescript
+             * @enum {string}
+             */
+            kind: "audit";
+            links: components["schemas"]["JobLinks"];
             progress: number;
+            rate_per_s: number | null;
             result: components["schemas"]["VerificationResult"] | null;
+            started_at: string | null;
             /** @enum {string} */
             state: "queued" | "running" | "done" | "failed" | "cancelled";
-        };
-        VerificationInput: {
-            expected_head?: string | null;
+            subject_id: string | null;
+            total: number | null;
         };
         VerificationResult: {
             entries: number;
             fault_count: number;
-            faults: components["schemas"]["AuditFaultDocument"][];
+            faults: components["schemas"]["AuditFault"][];
             head: string | null;
             versions: number;
         };
@@ -6958,7 +7118,7 @@ export interface components {
         WebhookList: {
             items: components["schemas"]["WebhookDocument"][];
         };
-        WrongReadingDocument: {
+        WrongInDrive: {
             drive: number;
             marker: number;
             text: string;
@@ -8029,7 +8189,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -8084,29 +8244,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["VerificationDocument"];
-                };
-            };
-        };
-    };
-    get_verification: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                verification_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["VerificationDocument"];
+                    "application/json": components["schemas"]["VerificationJob"];
                 };
             };
         };
@@ -9149,7 +9287,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -9199,30 +9337,6 @@ export interface operations {
             };
         };
     };
-    list_imports: {
-        parameters: {
-            query?: {
-                after?: string | null;
-                limit?: number;
-                state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
-            };
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["ImportJobPage"];
-                };
-            };
-        };
-    };
     post_import: {
         parameters: {
             query?: never;
@@ -9267,29 +9381,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["ImportJobDocument"];
-                };
-            };
-        };
-    };
-    get_import: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                import_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["ImportJobDocument"];
+                    "application/json": components["schemas"]["ImportJob"];
                 };
             };
         };
@@ -9302,6 +9394,7 @@ export interface operations {
                 kind?: components["schemas"]["JobKind"] | null;
                 limit?: number;
                 state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
+                subject_id?: string | null;
             };
             header?: never;
             path?: never;
@@ -9337,7 +9430,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["PlanJob"] | components["schemas"]["ProofJob"] | components["schemas"]["PackageJob"] | components["schemas"]["ImportJob"] | components["schemas"]["VerificationJob"] | components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -9359,7 +9452,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["JobDocument"];
+                    "application/json": components["schemas"]["PlanJob"] | components["schemas"]["ProofJob"] | components["schemas"]["PackageJob"] | components["schemas"]["ImportJob"] | components["schemas"]["VerificationJob"] | components["schemas"]["OtherJob"];
                 };
             };
         };
@@ -10169,53 +10262,6 @@ export interface operations {
             };
         };
     };
-    list_plan_jobs: {
-        parameters: {
-            query?: {
-                after?: string | null;
-                limit?: number;
-                plan_id?: string | null;
-                state?: ("queued" | "running" | "done" | "failed" | "cancelled") | null;
-            };
-            header?: never;
-            path?: never;
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["PlanJobPage"];
-                };
-            };
-        };
-    };
-    get_plan_job: {
-        parameters: {
-            query?: never;
-            header?: never;
-            path: {
-                job_id: string;
-            };
-            cookie?: never;
-        };
-        requestBody?: never;
-        responses: {
-            /** @description Successful Response */
-            200: {
-                headers: {
-                    [name: string]: unknown;
-                };
-                content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
-                };
-            };
-        };
-    };
     post_plan_preview: {
         parameters: {
             query?: {
@@ -10343,7 +10389,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
+                    "application/json": components["schemas"]["PlanJob"];
                 };
             };
         };
@@ -10566,7 +10612,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["PackageIn"];
+                "application/json": components["schemas"]["PackageOptions"];
             };
         };
         responses: {
@@ -10576,7 +10622,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
+                    "application/json": components["schemas"]["PackageJob"];
                 };
             };
         };
@@ -10598,7 +10644,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["ProofDocument"];
+                    "application/json": components["schemas"]["ProofReport"];
                 };
             };
         };
@@ -10627,7 +10673,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["PlanJobDocument"];
+                    "application/json": components["schemas"]["ProofJob"];
                 };
             };
         };
@@ -10666,7 +10712,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["PlateDraftIn"];
+                "application/json": components["schemas"]["PlateDraft"];
             };
         };
         responses: {
@@ -10692,7 +10738,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["DraftArtworkIn"];
+                "application/json": components["schemas"]["DraftToDraw"];
             };
         };
         responses: {
@@ -10720,7 +10766,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["CameraPassIn"];
+                "application/json": components["schemas"]["DraftToPass"];
             };
         };
         responses: {
@@ -10730,7 +10776,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["CameraPassDocument"];
+                    "application/json": components["schemas"]["CameraPass"];
                 };
             };
         };
@@ -10744,7 +10790,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["CameraViewIn"];
+                "application/json": components["schemas"]["DraftToView"];
             };
         };
         responses: {
@@ -10890,7 +10936,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
-                    "application/json": components["schemas"]["RadioCheckDocument"];
+                    "application/json": components["schemas"]["RadioCheck"];
                 };
             };
         };
