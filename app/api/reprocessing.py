@@ -6,13 +6,11 @@ from typing import Annotated
 
 from fastapi import Path, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import ConfigDict, Field
 
-from app.api.http.dependencies import Caller, Identifier, LastId, Number, PageSize, Text, use_case
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_case
 from app.api.http.permissions import ADMINS, EVERYBODY
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
-    Time,
     created_response,
     document_response,
     file_response,
@@ -20,9 +18,6 @@ from app.api.http.responses import (
     page_response,
 )
 from app.api.http.routes import Router
-from app.families.documents import StrictModel
-from app.services.decodes.context import DecodeKind
-from app.services.markers.searches import checked_box
 from app.services.reprocessing import (
     Criteria,
     DecodeVersions,
@@ -42,48 +37,20 @@ ReprocessingId = Annotated[Identifier, Path(description="Id of the reprocessing.
 Service = Annotated[Reprocessings, use_case(lambda cases: cases.reprocessings)]
 
 
-class ReprocessingIn(StrictModel):
-    """Which uploads are decoded again; without criteria, all that are stored."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [{"kinds": ["frame", "archive"], "older_than": "0.3.0"}]})
-
-    kinds: list[DecodeKind] | None = Field(None, min_length=1, max_length=20)
-    since: Time | None = Field(None, description="Uploaded at this time or later.")
-    until: Time | None = Field(None, description="Uploaded before this time.")
-    vehicle_id: Identifier | None = None
-    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
-        None, description="west, south, east, north of the coarse positions. [deg]"
-    )
-    decoder: Text | None = Field(None, max_length=200, description="Results of this decoder, as they name it.")
-    older_than: Text | None = Field(None, max_length=40, description="Results of earlier releases: 0.3.0.")
-
-    def criteria(self) -> Criteria:
-        """The criteria as the use cases know them."""
-        box = self.bbox
-        if box is not None:
-            checked_box(*box)
-        return Criteria(
-            tuple(self.kinds) if self.kinds is not None else None, self.since, self.until, self.vehicle_id,
-            (box[0], box[1], box[2], box[3]) if box is not None else None, self.decoder, self.older_than,
-        )  # fmt: skip
-
-
 @router.post(
     "",
     ADMINS,
     status_code=202,
     responses=document_response(ReprocessingDocument, status=202, description="Queued; Location leads to its progress"),
 )
-def post_reprocessing(wanted: ReprocessingIn, caller: Caller, reprocessings: Service) -> Response:
+def post_reprocessing(criteria: Criteria, caller: Caller, reprocessings: Service) -> Response:
     """Decode stored uploads again with the present decoders.
 
     When no other work waits.
 
     The results are kept beside the current ones. Nothing changes until the reprocessing is approved.
     """
-    return created_response(
-        reprocessings.create(caller, wanted.criteria()), False, path="/v1/reprocessings", status=202
-    )
+    return created_response(reprocessings.create(caller, criteria), False, path="/v1/reprocessings", status=202)
 
 
 @router.get("", ADMINS, responses=document_response(ReprocessingPage))

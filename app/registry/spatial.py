@@ -177,6 +177,13 @@ class Box:
             Box(-180.0, self.south_deg, self.east_deg, self.north_deg),
         )
 
+    def contains(self, lon_deg: float, lat_deg: float) -> bool:
+        """Whether a place is in the box or on its border."""
+        over = self.west_deg > self.east_deg
+        is_east, is_west = lon_deg >= self.west_deg, lon_deg <= self.east_deg
+        across = is_east or is_west if over else is_east and is_west
+        return across and self.south_deg <= lat_deg <= self.north_deg
+
     def widened(self, margin_m: float) -> Box:
         """The box with at least this margin on each side."""
         margin_deg = margin_m / _M_PER_DEG

@@ -11,12 +11,13 @@ from datetime import datetime
 from typing import Annotated, Any, Literal, NamedTuple, NotRequired
 
 import sqlalchemy as sa
-from pydantic import Field, JsonValue
+from pydantic import ConfigDict, Field, JsonValue
 from pyproj import Geod
 from typing_extensions import TypedDict
 
 from app.errors import Conflict, InvalidParameter, NotFound, Unavailable, WaymarkError
 from app.formats.text import TableWriter
+from app.inputs import Identifier, Number, StrictModel, Text, Time
 from app.registry import decodes as decode_store
 from app.registry import jobs as job_store
 from app.registry import reprocessings as store
@@ -25,13 +26,16 @@ from app.registry.database import Database
 from app.registry.engines import across_agencies
 from app.registry.jobs import JobKind, new_job
 from app.registry.reprocessings import REPROCESSINGS, ReprocessedRow, ReprocessingRow
+from app.registry.spatial import Box
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
 from app.services.blobs import staged
+from app.services.decodes.context import DecodeKind
 from app.services.decodes.decodes import Decodes
 from app.services.decodes.upload_path import PICTURES
 from app.services.documents import ErrorDocument, error_document
 from app.services.jobs import QueueName, RunningJob, kinds_in
+from app.services.markers.searches import checked_box
 from app.services.ports import Blobs, Clock, JobQueue
 
 # === Two results of one upload, reading by reading.
@@ -332,17 +336,20 @@ _CSV = (
 )  # fmt: skip
 
 
-class Criteria(NamedTuple):
-    """Which uploads are decoded again."""
+class Criteria(StrictModel):
+    """Which uploads are decoded again; without criteria, all that are stored."""
 
-    kinds: tuple[str, ...] | None = None
-    # `since`, `until`: when they were uploaded
-    since: datetime | None = None
-    until: datetime | None = None
-    vehicle_id: str | None = None
-    bbox: tuple[float, float, float, float] | None = None  # [deg] west, south, east, north of their coarse positions
-    decoder: str | None = None  # only results of this decoder
-    older_than: str | None = None  # only results of earlier releases, e.g. ``0.3.0``.
+    model_config = ConfigDict(json_schema_extra={"examples": [{"kinds": ["frame", "archive"], "older_than": "0.3.0"}]})
+
+    kinds: list[DecodeKind] | None = Field(None, min_length=1, max_length=20)
+    since: Time | None = Field(None, description="Uploaded at this time or later.")
+    until: Time | None = Field(None, description="Uploaded before this time.")
+    vehicle_id: Identifier | None = None
+    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="west, south, east, north of the coarse positions. [deg]"
+    )
+    decoder: Text | None = Field(None, max_length=200, description="Results of this decoder, as they name it.")
+    older_than: Text | None = Field(None, max_length=40, description="Results of earlier releases: 0.3.0.")
 
 
 class Reprocessings:
@@ -368,18 +375,19 @@ class Reprocessings:
         """
         if criteria.older_than is not None and _RELEASE.fullmatch(criteria.older_than) is None:
             raise InvalidParameter(f"{criteria.older_than[:40]!r} is no release", field="older_than", limit="0.3.0")
+        box = None if criteria.bbox is None else checked_box(*criteria.bbox)
         now, agency_id = self._clock(), caller.agency_id
         with self._database.read(long=True) as connection:
             found = store.stream_decodes(
                 connection, agency_id, kinds=criteria.kinds, since=criteria.since, until=criteria.until,
                 vehicle_id=criteria.vehicle_id,
             )  # fmt: skip
-            ids = [row.id for row in found if _is_meant(row.context, row.decoder, criteria)]
+            ids = [row.id for row in found if _is_meant(row.context, row.decoder, criteria, box)]
         if not 1 <= len(ids) <= MAX_DECODES:
             raise InvalidParameter(
                 f"{len(ids)} uploads meet the criteria", limit=f"1 to {MAX_DECODES}", cure="change the criteria"
             )
-        stored = {name: _plain(value) for name, value in criteria._asdict().items() if value is not None}
+        stored = criteria.model_dump(mode="json", exclude_none=True)
         row = ReprocessingRow(new_id(now), agency_id, caller.label, stored, len(ids), now)
         shards = [ids[start : start + SHARD] for start in range(0, len(ids), SHARD)]
         jobs = [
@@ -548,12 +556,15 @@ class Reprocessings:
         return reprocessing_document(row, store.count_jobs(connection, row.id), store.sums(connection, row.id))
 
 
-def _is_meant(context: Mapping[str, Any], decoder: str | None, criteria: Criteria) -> bool:
+def _is_meant(context: Mapping[str, Any], decoder: str | None, criteria: Criteria, box: Box | None) -> bool:
     if criteria.decoder is not None and decoder != criteria.decoder:
         return False
     if criteria.older_than is not None and not _is_older(decoder, criteria.older_than):
         return False
-    return criteria.bbox is None or _is_inside(context, criteria.bbox)
+    if box is None:
+        return True
+    position = context.get("coarse_position")
+    return position is not None and box.contains(position["lon_deg"], position["lat_deg"])
 
 
 def _is_older(decoder: str | None, release: str) -> bool:
@@ -567,20 +578,6 @@ def _is_older(decoder: str | None, release: str) -> bool:
 def _numbers(release: str) -> tuple[int, ...]:
     numbers = [int(part) for part in release.split(".") if part]
     return tuple(numbers + [0] * (3 - len(numbers)))
-
-
-def _is_inside(context: Mapping[str, Any], bbox: tuple[float, float, float, float]) -> bool:
-    position = context.get("coarse_position")
-    if not position:
-        return False
-    west, south, east, north = bbox
-    lon, lat = position["lon_deg"], position["lat_deg"]
-    across = west <= lon <= east if west <= east else lon >= west or lon <= east
-    return bool(across and south <= lat <= north)
-
-
-def _plain(value: object) -> object:
-    return value.isoformat() if isinstance(value, datetime) else list(value) if isinstance(value, tuple) else value
 
 
 def _line(values: Mapping[str, object]) -> bytes:

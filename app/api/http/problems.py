@@ -44,12 +44,10 @@ def with_reference(response: dict[str, Any]) -> dict[str, Any]:
     return {**described, "content": {**described.get("content", {}), "application/json": {"schema": schema}}}
 
 
-def component_schemas(others: Iterable[tuple[object, Mode]] = ()) -> dict[str, Any]:
+def component_schemas(others: Iterable[tuple[Any, Mode]] = ()) -> dict[str, Any]:
     """The schemas of all models that are referred to, of others, and of the models within them, by name."""
-    models: tuple[tuple[object, Mode], ...] = (*_MODELS.values(), *others)
-    adapters: list[tuple[int, Mode, TypeAdapter[object]]] = [
-        (number, mode, TypeAdapter(model)) for number, (model, mode) in enumerate(models)
-    ]
+    models = (*_MODELS.values(), *others)
+    adapters = [(number, mode, TypeAdapter(model)) for number, (model, mode) in enumerate(models)]
     _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE)
     found: dict[str, Any] = schemas["$defs"]
     return found
