@@ -2722,13 +2722,6 @@ export interface components {
             materials: components["schemas"]["CostDocument"][];
             total_usd: number;
         };
-        Board: {
-            columns: number;
-            dictionary: string;
-            marker_mm: number;
-            rows: number;
-            square_mm: number;
-        };
         /** @enum {string} */
         BoundaryStyle: "solid" | "dashed" | "none" | "unknown";
         BuiltMarker: {
@@ -2779,6 +2772,11 @@ export interface components {
         CalibrationBoard: {
             /** @default 7 */
             columns?: number;
+            /**
+             * @default DICT_5X5_100
+             * @constant
+             */
+            dictionary?: "DICT_5X5_100";
             /** @default 18 */
             marker_mm?: number;
             /** @default 10 */
@@ -2795,7 +2793,8 @@ export interface components {
              *       "columns": 7,
              *       "rows": 10,
              *       "square_mm": 25,
-             *       "marker_mm": 18
+             *       "marker_mm": 18,
+             *       "dictionary": "DICT_5X5_100"
              *     }
              */
             board?: components["schemas"]["CalibrationBoard"];
@@ -2803,7 +2802,7 @@ export interface components {
             coefficients?: (4 | 5 | 8) | null;
         };
         CalibrationDocument: {
-            board: components["schemas"]["Board"];
+            board: components["schemas"]["CalibrationBoard"];
             camera: components["schemas"]["CalibratedCamera"];
             coverage: components["schemas"]["Coverage"];
             /** Format: date-time */
@@ -2811,25 +2810,14 @@ export interface components {
             decoder: string;
             id: string;
             rms_px: number;
-            sigma: components["schemas"]["CameraSigma"];
+            sigma: components["schemas"]["Intrinsics"];
             summary: string;
             tilt_spread_deg: number;
-            views: components["schemas"]["CalibrationView"][];
+            views: components["schemas"]["ViewReport"][];
             who: string;
         };
         CalibrationPage: {
             items: components["schemas"]["CalibrationDocument"][];
-        };
-        CalibrationView: {
-            corners: number;
-            detail: string | null;
-            edge_width_px: number | null;
-            name: string;
-            photo: number;
-            reason: string | null;
-            rms_px: number | null;
-            tilt_deg: number | null;
-            used: boolean;
         };
         CameraDeclaration: {
             /** @default 0 */
@@ -2906,13 +2894,6 @@ export interface components {
             rolling_shutter_s?: number;
             /** @default 1920 */
             width_px?: number;
-        };
-        CameraSigma: {
-            cx_px: number;
-            cy_px: number;
-            distortion: number[];
-            fx_px: number;
-            fy_px: number;
         };
         CameraViewIn: {
             /** @default 4 */
@@ -4310,6 +4291,13 @@ export interface components {
             segment_m: number;
             text: string;
             tuple: string;
+        };
+        Intrinsics: {
+            cx_px: number;
+            cy_px: number;
+            distortion: number[];
+            fx_px: number;
+            fy_px: number;
         };
         ItemEvidence: {
             elsewhere_lat_deg?: number;
@@ -6817,6 +6805,23 @@ export interface components {
         VersionKind: "as-planned" | "as-built" | "resurvey" | "correction" | "change";
         VersionPage: {
             items: components["schemas"]["VersionDocument"][];
+        };
+        /** @enum {string} */
+        ViewFault: "no-board" | "wrong-board" | "mirrored" | "too-few-corners" | "blurred" | "other-size" | "alike" | "does-not-fit" | "not-a-picture" | "unreadable" | "too-large";
+        ViewReport: {
+            /** @default 0 */
+            corners?: number;
+            detail: string | null;
+            /** @default null */
+            edge_width_px?: number | null;
+            name: string;
+            photo: number;
+            reason: components["schemas"]["ViewFault"] | null;
+            /** @default null */
+            rms_px?: number | null;
+            /** @default null */
+            tilt_deg?: number | null;
+            used: boolean;
         };
         WarningDocument: {
             code: string;
