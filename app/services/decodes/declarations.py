@@ -23,9 +23,6 @@ from app.sensors.camera import Camera, CameraDeclaration
 # === What an upload declares of its files.
 
 
-TraceMethod = Literal["matched", "metro"]
-
-
 class DeclaredTrace(TraceDeclaration):
     """What is declared of a recording. METRO's stream and recorder files need nothing: send {}."""
 
@@ -34,7 +31,7 @@ class DeclaredTrace(TraceDeclaration):
     tag_formats: tuple[TagFormat, ...] | None = Field(
         None, min_length=1, max_length=20, description="Tags to look for where none is registered nearby."
     )
-    method: TraceMethod = Field("matched", description="`metro` is the paper's own pipeline.")
+    method: Literal["matched", "metro"] = Field("matched", description="`metro` is the paper's own pipeline.")
     reach_m: Number = Field(
         2000.0, gt=0, le=20_000, description="How far from the coarse position the drive may lead. [m]"
     )
