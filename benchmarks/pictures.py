@@ -121,7 +121,7 @@ def _write_trace() -> None:
         for name, data in write_recorder_files(drive.trace).items():
             archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
     (IMAGES / "drive.zip").write_bytes(packed.getvalue())
-    result = decode_recording("drive.zip", SpooledFile.of(packed.getvalue()), {}, (tag.text,))
+    result = decode_recording("drive.zip", SpooledFile.of(packed.getvalue()), tags=(tag.text,))
     (IMAGES / "trace.svg").write_bytes(result.plot)
 
 

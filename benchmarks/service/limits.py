@@ -144,7 +144,7 @@ def jobs_per_s(url: str, processes: int, seconds: float) -> float:
 
 def _recording_h(data: bytes) -> float:
     """Length of the recording that is decoded. [h]"""
-    result = decode_recording("drive.zip", SpooledFile.of(data), {})
+    result = decode_recording("drive.zip", SpooledFile.of(data))
     return result.report.duration_s / 3600
 
 

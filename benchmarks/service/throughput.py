@@ -100,7 +100,7 @@ def _bare_frames(files: Sequence[bytes]) -> Callable[[bytes], object]:
 
 def _bare_traces(files: Sequence[bytes]) -> Callable[[bytes], object]:
     def decode(data: bytes) -> object:
-        return decode_recording("drive.zip", SpooledFile.of(data), {})
+        return decode_recording("drive.zip", SpooledFile.of(data))
 
     decode(files[0])
     return decode

@@ -63,7 +63,7 @@ class TraceResult:
 def decode_recording(
     name: str,
     file: SpooledFile,
-    declared: DeclaredTrace,
+    declared: DeclaredTrace = DeclaredTrace(),
     tags: tuple[str, ...] = (),
     formats: tuple[TagFormat, ...] = (),
     limits: TraceLimits = TraceLimits(),
