@@ -25,7 +25,6 @@ from app.demo.road_plan import ORIGIN_DEG, ROAD, RULES, plan_road
 from app.demo.server import LocalServer
 from app.formats.format import SpooledFile
 from app.markers.magnet import InformationTag, Polarity, parse_tag
-from app.services.decodes.declarations import DeclaredTrace
 from app.services.decodes.trace_tasks import decode_recording
 from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
@@ -122,7 +121,7 @@ def _write_trace() -> None:
         for name, data in write_recorder_files(drive.trace).items():
             archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
     (IMAGES / "drive.zip").write_bytes(packed.getvalue())
-    result = decode_recording("drive.zip", SpooledFile.of(packed.getvalue()), DeclaredTrace(), (tag.text,))
+    result = decode_recording("drive.zip", SpooledFile.of(packed.getvalue()), tags=(tag.text,))
     (IMAGES / "trace.svg").write_bytes(result.plot)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
 from typing import Any
@@ -288,18 +288,23 @@ class CalibrationRules:
 
 @dataclass(frozen=True, slots=True)
 class ViewReport:
-    """How a photo was used, or why it was left out."""
+    """A photo: whether it was used, or the reason why it was not."""
 
     photo: int  # from 0, as they were sent
     name: str
-    fault: ViewFault | None = None  # None where it was used
-    detail: str = ""
+    used: bool
+    reason: ViewFault | None
+    detail: str | None
     corners: int = 0
     # `rms_px`, `tilt_deg`: reprojection error; angle between the board and the image plane. Of views that were used.
     # [px, deg]
     rms_px: float | None = None
     tilt_deg: float | None = None
     edge_width_px: float | None = None
+
+    def left_out(self, reason: ViewFault, detail: str) -> ViewReport:
+        """The photo that is not used."""
+        return replace(self, used=False, reason=reason, detail=detail)
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,22 +317,41 @@ class Photo:
     view: BoardView
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraCalibration:
-    """A calibrated camera."""
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """Parameters of a camera, or their standard deviations; pixel centres at integers."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...]  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedCamera(Intrinsics):
+    """Intrinsics and distortion, in the members of a decode's camera."""
 
     width_px: int
     height_px: int
-    parameters: dict[str, float]  # [px] fx_px, fy_px, cx_px, cy_px; pixel centres at integers
-    distortion: tuple[float, ...]  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]
-    sigma: dict[str, float]  # [px] standard deviations of the parameters
-    distortion_sigma: tuple[float, ...]  # of the coefficients
-    rms_px: float  # [px] reprojection error over all views
-    views: tuple[ViewReport, ...]  # one a photo
-    covered: npt.NDArray[np.bool_]  # shape (6, 8): cells of the image with a corner in them
-    tilt_spread_deg: float  # [deg] largest angle between two views of the board
 
-    @property
-    def coverage(self) -> float:
-        """Share of the image's cells with a corner in them."""
-        return float(self.covered.mean())
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Cells of the image, 6 rows of 8, that have a corner in them."""
+
+    share: float
+    cells: list[list[int]]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """A calibrated camera."""
+
+    camera: CalibratedCamera
+    sigma: Intrinsics
+    rms_px: float  # [px] reprojection error over all views
+    coverage: Coverage
+    tilt_spread_deg: float  # [deg] largest angle between two views of the board
+    board: CalibrationBoard
+    views: tuple[ViewReport, ...]  # one a photo

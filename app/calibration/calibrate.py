@@ -13,7 +13,17 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.calibration.board_view import BoardView, CalibrationRules, CameraCalibration, Photo, ViewFault, ViewReport
+from app.calibration.board_view import (
+    BoardView,
+    CalibratedCamera,
+    CalibrationRules,
+    CameraCalibration,
+    Coverage,
+    Intrinsics,
+    Photo,
+    ViewFault,
+    ViewReport,
+)
 from app.errors import CalibrationRefused, InvalidParameter, UnreadableUpload, WaymarkError
 from app.sensors.camera import CalibrationBoard
 
@@ -22,7 +32,6 @@ Floats = npt.NDArray[np.float64]
 VERSION = "calibration/1"
 COEFFICIENTS = (4, 5, 8)
 """Numbers of distortion coefficients: k1, k2, p1, p2; with k3; with k4, k5, k6. Source: OpenCV's models."""
-_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px")
 _CELLS = (6, 8)
 """[rows, columns] of cells over which coverage is counted."""
 _ROUNDS = 4
@@ -70,11 +79,16 @@ def calibrate_camera(
         )
     reports = [
         ViewReport(
-            k, photo.name, photo.view.fault, photo.view.detail, len(photo.view.corner),
-            edge_width_px=_or_none(photo.view.edge_width_px),
+            k,
+            photo.name,
+            photo.view.fault is None,
+            photo.view.fault,
+            photo.view.detail or None,
+            len(photo.view.corner),
+            edge_width_px=round(photo.view.edge_width_px, 3) if np.isfinite(photo.view.edge_width_px) else None,
         )
         for k, photo in enumerate(photos)
-    ]  # fmt: skip
+    ]
     size = _leave_out_other_sizes(photos, reports)
     _leave_out_alike(photos, reports, size, rules)
     fit = _fit(photos, reports, size, board, coefficients, rules)
@@ -82,7 +96,7 @@ def calibrate_camera(
         if not _leave_out_misfits(fit, reports, rules):
             break
         fit = _fit(photos, reports, size, board, coefficients, rules)
-    return _assess(fit, photos, reports, size, rules)
+    return _assess(fit, photos, reports, size, board, rules)
 
 
 @dataclass(slots=True, eq=False)
@@ -96,25 +110,21 @@ class _Fit:
     view_rms_px: Floats
 
 
-def _or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
 def _leave_out_other_sizes(photos: Sequence[Photo], reports: list[ViewReport]) -> tuple[int, int]:
     """Keep the size, turned one way, that most usable photos have."""
     kinds = [(photo.size_px, photo.orientation) for photo in photos]
-    usable = [kind for kind, report in zip(kinds, reports, strict=True) if report.fault is None]
+    usable = [kind for kind, report in zip(kinds, reports, strict=True) if report.used]
     if not usable:
         return 0, 0
     usual = max(usable, key=usable.count)
     for k, kind in enumerate(kinds):
-        if reports[k].fault is None and kind != usual:
+        if reports[k].used and kind != usual:
             width, height = kind[0] or (0, 0)
             other = (
                 f"turned otherwise (EXIF orientation {kind[1]})" if kind[0] == usual[0] else f"{width} x {height} px"
             )
             detail = f"{other}; most photos have {usual[0][0]} x {usual[0][1]} px" if usual[0] else other
-            reports[k] = replace(reports[k], fault=ViewFault.OTHER_SIZE, detail=detail)
+            reports[k] = reports[k].left_out(ViewFault.OTHER_SIZE, detail)
     return usual[0] or (0, 0)
 
 
@@ -124,7 +134,7 @@ def _leave_out_alike(
     """Of views that show the board in the same place, keep the first."""
     kept: list[int] = []
     for k, report in enumerate(reports):
-        if report.fault is not None:
+        if not report.used:
             continue
         twin = next(
             (j for j in kept if _mean_shift_px(photos[j].view, photos[k].view) < rules.alike_share * np.hypot(*size)),
@@ -134,7 +144,7 @@ def _leave_out_alike(
             kept.append(k)
         else:
             detail = f"the board is in the same place as in photo {twin}"
-            reports[k] = replace(report, fault=ViewFault.ALIKE, detail=detail)
+            reports[k] = report.left_out(ViewFault.ALIKE, detail)
 
 
 def _mean_shift_px(first: BoardView, second: BoardView) -> float:
@@ -149,9 +159,9 @@ def _fit(
     photos: Sequence[Photo], reports: list[ViewReport], size: tuple[int, int], board: CalibrationBoard,
     coefficients: int | None, rules: CalibrationRules,
 ) -> _Fit:  # fmt: skip
-    used = [report.photo for report in reports if report.fault is None]
+    used = [report.photo for report in reports if report.used]
     if len(used) < rules.min_views:
-        alike = sum(report.fault is ViewFault.ALIKE for report in reports)
+        alike = sum(report.reason is ViewFault.ALIKE for report in reports)
         if alike and len(used) + alike >= rules.min_views:
             raise _refusal(
                 "views-alike", f"{len(used)} different views of the board, {alike} repeat them", "photos",
@@ -203,31 +213,35 @@ def _leave_out_misfits(fit: _Fit, reports: list[ViewReport], rules: CalibrationR
     for k in bad:
         detail = f"reprojection error {fit.view_rms_px[k]:.2f} px, the limit beside the others is {limit:.2f} px"
         photo = fit.used[k]
-        reports[photo] = replace(reports[photo], fault=ViewFault.DOES_NOT_FIT, detail=detail)
+        reports[photo] = reports[photo].left_out(ViewFault.DOES_NOT_FIT, detail)
     return bool(bad)
 
 
 def _assess(
-    fit: _Fit, photos: Sequence[Photo], reports: list[ViewReport], size: tuple[int, int], rules: CalibrationRules
+    fit: _Fit,
+    photos: Sequence[Photo],
+    reports: list[ViewReport],
+    size: tuple[int, int],
+    board: CalibrationBoard,
+    rules: CalibrationRules,
 ) -> CameraCalibration:
     normals = fit.rotations[:, :, 2]
     tilt = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0, 1)))
     spread_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
     for k, photo in enumerate(fit.used):
-        reports[photo] = replace(reports[photo], rms_px=float(fit.view_rms_px[k]), tilt_deg=float(tilt[k]))
+        rms_px, tilt_deg = round(float(fit.view_rms_px[k]), 3), round(float(tilt[k]), 3)
+        reports[photo] = replace(reports[photo], rms_px=rms_px, tilt_deg=tilt_deg)
     covered = _covered([photos[k].view.corners_px for k in fit.used], size)
-    parameters = (fit.matrix[0, 0], fit.matrix[1, 1], fit.matrix[0, 2], fit.matrix[1, 2])
-    count = len(fit.distortion)
+    (fx, _, cx), (_, fy, cy), _ = fit.matrix.tolist()
+    fx_sigma, fy_sigma, cx_sigma, cy_sigma, *of_distortion = fit.sigma.tolist()
     found = CameraCalibration(
-        *size,
-        {name: float(value) for name, value in zip(_NAMES, parameters, strict=True)},
-        tuple(float(value) for value in fit.distortion),
-        {name: float(value) for name, value in zip(_NAMES, fit.sigma[:4], strict=True)},
-        tuple(float(value) for value in fit.sigma[4 : 4 + count]),
+        CalibratedCamera(fx, fy, cx, cy, tuple(fit.distortion.tolist()), *size),
+        Intrinsics(fx_sigma, fy_sigma, cx_sigma, cy_sigma, tuple(of_distortion[: len(fit.distortion)])),
         fit.rms_px,
-        tuple(reports),
-        covered,
+        Coverage(float(covered.mean()), covered.astype(int).tolist()),
         spread_deg,
+        board,
+        tuple(reports),
     )
     _check(found, rules)
     return found
@@ -244,13 +258,14 @@ def _covered(corners_px: Sequence[Floats], size: tuple[int, int]) -> npt.NDArray
 
 def _check(found: CameraCalibration, rules: CalibrationRules) -> None:
     """Refuse a calibration that is not good enough, with the simplest reason first."""
-    focal_share = max(found.sigma[name] / abs(found.parameters[name]) for name in ("fx_px", "fy_px"))
+    camera, sigma = found.camera, found.sigma
+    focal_share = max(sigma.fx_px / abs(camera.fx_px), sigma.fy_px / abs(camera.fy_px))
     checks = (
         (found.tilt_spread_deg >= rules.min_tilt_deg, "views-alike",
          f"the board is tilted by {found.tilt_spread_deg:.1f} degrees at most from view to view",
          f"{rules.min_tilt_deg:g} degrees", "tilt the board by 30 to 45 degrees, to each side"),
-        (found.coverage >= rules.min_coverage, "poor-coverage",
-         f"corners lie in {found.coverage:.0%} of the image's cells",
+        (found.coverage.share >= rules.min_coverage, "poor-coverage",
+         f"corners lie in {found.coverage.share:.0%} of the image's cells",
          f"{rules.min_coverage:.0%}", "bring the board into the corners of the image too"),
         (found.rms_px <= rules.max_rms_px, "high-error",
          f"the reprojection error is {found.rms_px:.2f} px",
@@ -258,7 +273,7 @@ def _check(found: CameraCalibration, rules: CalibrationRules) -> None:
         (focal_share <= rules.max_focal_share, "unsure-focal-length",
          f"the standard deviation of the focal length is {focal_share:.2%}",
          f"{rules.max_focal_share:.2%}", "take more photos, nearer, with the board more tilted"),
-        (is_invertible(found), "distortion-turns-back",
+        (is_invertible(camera), "distortion-turns-back",
          "the distortion turns back within the image", "one ray a pixel",
          "cover the corners of the image, or ask for fewer coefficients"),
     )  # fmt: skip
@@ -267,14 +282,13 @@ def _check(found: CameraCalibration, rules: CalibrationRules) -> None:
             raise _refusal(reason, message, "photos", limit, cure, found.views)
 
 
-def is_invertible(found: CameraCalibration) -> bool:
+def is_invertible(camera: CalibratedCamera) -> bool:
     """Whether each pixel of the image's edge has its own ray: undistorted and distorted again, it is the same pixel."""
-    p = found.parameters
-    matrix = np.array([[p["fx_px"], 0, p["cx_px"]], [0, p["fy_px"], p["cy_px"]], [0, 0, 1]])
-    w, h = found.width_px - 1.0, found.height_px - 1.0
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    w, h = camera.width_px - 1.0, camera.height_px - 1.0
     edge = np.array([(x, y) for x in np.linspace(0, w, 9) for y in (0.0, h)] + [(x, h / 2) for x in (0.0, w)])
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-    distortion = np.array(found.distortion)
+    distortion = np.array(camera.distortion)
     rays = cv2.undistortPoints(edge.reshape(-1, 1, 2), matrix, distortion, None, None, None, criteria)
     back, _ = cv2.projectPoints(
         np.concatenate([rays.reshape(-1, 2), np.ones((len(edge), 1))], axis=1),
@@ -290,9 +304,9 @@ def _refusal(
     reason: str, message: str, field: str, limit: str, cure: str, views: Sequence[ViewReport]
 ) -> CalibrationRefused:
     parts: list[WaymarkError] = [
-        UnreadableUpload(f"{view.fault}: {view.name}: {view.detail}", field=f"photos.{view.photo}")
+        UnreadableUpload(f"{view.reason}: {view.name}: {view.detail}", field=f"photos.{view.photo}")
         for view in views
-        if view.fault is not None
+        if not view.used
     ]
     error = CalibrationRefused(f"{reason}: {message}", field=field, limit=limit, cure=cure)
     error.parts = tuple(parts)

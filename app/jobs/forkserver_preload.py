@@ -35,6 +35,7 @@ DECODERS = (
     "app.decoders.plate.print_grade",
     "app.decoders.plate.reader",
     "app.decoders.plate.video_search",
+    "app.lanes.control",
     "app.lanes.estimate",
     "app.planning.build_alignment",
     "app.planning.planner",

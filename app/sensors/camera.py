@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -181,7 +181,7 @@ class CameraDeclaration(Declaration):
 
 Floats = npt.NDArray[np.float64]
 
-DICTIONARY = "DICT_5X5_100"
+DICTIONARY: Literal["DICT_5X5_100"] = "DICT_5X5_100"
 MODULES = 7
 """Of a marker along a side: five of its code and a black border."""
 SIDES = (4, 24)
@@ -209,6 +209,9 @@ class CalibrationBoard:
     rows: Annotated[Whole, Field(description="Squares down, 4 to 24; at most 200 squares.")] = 10
     square_mm: Annotated[Number, Field(description="Side of a square, 8 to 250. [mm]")] = 25.0
     marker_mm: Annotated[Number, Field(description="Side of a marker, 0.5 to 0.85 of a square. [mm]")] = 18.0
+    dictionary: Annotated[Literal["DICT_5X5_100"], Field(description="ArUco markers of the white squares.")] = (
+        DICTIONARY
+    )
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows"):

@@ -30,7 +30,6 @@ from app.registry.database import Database
 from app.registry.decodes import DecodeRow
 from app.registry.engines import acting_for
 from app.registry.jobs import JobKind, new_job
-from app.services.decodes.declarations import DeclaredTrace
 from app.services.decodes.trace_tasks import decode_recording
 from benchmarks.service.throughput import PROCESSES, make_frames, measure_bare
 
@@ -145,7 +144,7 @@ def jobs_per_s(url: str, processes: int, seconds: float) -> float:
 
 def _recording_h(data: bytes) -> float:
     """Length of the recording that is decoded. [h]"""
-    result = decode_recording("drive.zip", SpooledFile.of(data), DeclaredTrace())
+    result = decode_recording("drive.zip", SpooledFile.of(data))
     return result.report.duration_s / 3600
 
 

@@ -35,7 +35,6 @@ from app.formats.images import load_image
 from app.jobs.decoder_process import ONE_THREAD, keep_memory
 from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.sensors.camera import Camera
-from app.services.decodes.declarations import DeclaredTrace
 from app.services.decodes.trace_tasks import decode_recording
 from benchmarks.faults.server import FaultServer
 from benchmarks.http_overhead import CAMERA, LAT_DEG, LON_DEG, STEP_DEG, frame_1080p
@@ -101,7 +100,7 @@ def _bare_frames(files: Sequence[bytes]) -> Callable[[bytes], object]:
 
 def _bare_traces(files: Sequence[bytes]) -> Callable[[bytes], object]:
     def decode(data: bytes) -> object:
-        return decode_recording("drive.zip", SpooledFile.of(data), DeclaredTrace())
+        return decode_recording("drive.zip", SpooledFile.of(data))
 
     decode(files[0])
     return decode

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue, model_validator
 
@@ -23,9 +23,6 @@ from app.sensors.camera import Camera, CameraDeclaration
 # === What an upload declares of its files.
 
 
-TraceMethod = Literal["matched", "metro"]
-
-
 class DeclaredTrace(TraceDeclaration):
     """What is declared of a recording. METRO's stream and recorder files need nothing: send {}."""
 
@@ -34,7 +31,7 @@ class DeclaredTrace(TraceDeclaration):
     tag_formats: tuple[TagFormat, ...] | None = Field(
         None, min_length=1, max_length=20, description="Tags to look for where none is registered nearby."
     )
-    method: TraceMethod = Field("matched", description="`metro` is the paper's own pipeline.")
+    method: Literal["matched", "metro"] = Field("matched", description="`metro` is the paper's own pipeline.")
     reach_m: Number = Field(
         2000.0, gt=0, le=20_000, description="How far from the coarse position the drive may lead. [m]"
     )
@@ -137,7 +134,7 @@ def _check_heading(heading_deg: float | None) -> float | None:
 
 
 class Profile(Declaration):
-    """What stays the same from upload to upload of a vehicle."""
+    """Members of a context that the profile of a vehicle can give."""
 
     camera: CameraDeclaration | None = None
     thermal: Flag | None = Field(None, description="The frames are from a thermal camera.")
@@ -206,7 +203,7 @@ class UploadContext(_Context):
 
 
 class UsedVehicle(Declaration):
-    """The vehicle of an upload, and whose word each member of the context is."""
+    """The vehicle of an upload, and where each member of the context is from."""
 
     id: str
     name: str
@@ -244,6 +241,6 @@ class DecodeContext(_Context):
         """
         return self.camera.camera_of(frame.width_px, frame.height_px) if self.camera is not None else None
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """The context as it is stored: the members that were declared."""
         return self.model_dump(mode="json", exclude_unset=True)

@@ -52,7 +52,7 @@ class DriveFiles:
 def read_drive(
     name: str,
     file: SpooledFile,
-    declared: DeclaredPackets,
+    declared: DeclaredPackets = DeclaredPackets(),
     limits: PacketLimits = PacketLimits(),
     images: ImageLimits = ImageLimits(),
 ) -> DriveFiles:

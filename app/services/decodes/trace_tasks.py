@@ -61,7 +61,7 @@ class DecodedTrace:
 def decode_recording(
     name: str,
     file: SpooledFile,
-    declared: DeclaredTrace,
+    declared: DeclaredTrace = DeclaredTrace(),
     tags: tuple[str, ...] = (),
     formats: tuple[TagFormat, ...] = (),
     limits: TraceLimits = TraceLimits(),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import timedelta
-from typing import Literal
+from typing import Literal, cast
 
 from pydantic import ConfigDict, Field, JsonValue
 
 from app import __version__
-from app.calibration.board_view import CameraCalibration, ViewReport
+from app.calibration.board_view import CameraCalibration
 from app.calibration.calibrate import VERSION
 from app.errors import UnreadableUpload, UploadTooLarge
 from app.formats.format import SpooledFile
@@ -17,19 +18,10 @@ from app.inputs import Declaration
 from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.vehicles import CALIBRATIONS, CalibrationRow
-from app.sensors.camera import DICTIONARY, CalibrationBoard
+from app.sensors.camera import CalibrationBoard
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
-from app.services.documents import document_of
-from app.services.fleet.documents import (
-    Board,
-    CalibratedCamera,
-    CalibrationDocument,
-    CalibrationPage,
-    CalibrationResult,
-    CalibrationView,
-    CameraSigma,
-)
+from app.services.fleet.documents import CalibrationDocument, CalibrationPage
 from app.services.fleet.tasks import MAX_PHOTOS, calibrate_photos
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.ports import Clock, DecoderProcesses
@@ -102,7 +94,7 @@ class Calibrations:
         _check_count(photos)
         board, coefficients = declared.board, declared.coefficients
         found = self._processes.run(calibrate_photos, photos, board, coefficients, self._images, wait_s=_BUSY_WAIT_S)
-        result = calibration_result(found, board)
+        result = calibration_result(found)
         row = CalibrationRow(id=new_id(now), who=caller.label, result=result, created_at=now)
         with write_once(self._database, caller.agency_id, key, now, self._ttl) as (connection, answer):
             if answer.replayed:
@@ -128,58 +120,19 @@ class Calibrations:
 
 def calibration_document(row: CalibrationRow) -> CalibrationDocument:
     """A calibration as clients see it."""
-    result: CalibrationResult = row.result
-    return {"id": row.id, "created_at": row.created_at, "who": row.who, **result}
+    return cast("CalibrationDocument", {"id": row.id, "created_at": row.created_at, "who": row.who, **row.result})
 
 
-def calibration_result(found: CameraCalibration, board: CalibrationBoard) -> CalibrationResult:
-    """What is kept of a calibration; `camera` has the members of a context's camera."""
-    used = [view for view in found.views if view.fault is None]
+def calibration_result(found: CameraCalibration) -> dict[str, object]:
+    """What is stored of a calibration; `camera` has the members of a context's camera."""
+    used = sum(view.used for view in found.views)
     return {
         "decoder": f"waymark {__version__} {VERSION}",
-        "summary": f"{len(used)} of {len(found.views)} photos used, reprojection error {found.rms_px:.3f} px, "
-        f"focal length {found.parameters['fx_px']:.1f} ± {found.sigma['fx_px']:.1f} px, "
-        f"{found.coverage:.0%} of the image covered",
-        "camera": _camera(found),
-        "sigma": _sigma(found),
-        "rms_px": found.rms_px,
-        "coverage": {"share": found.coverage, "cells": found.covered.astype(int).tolist()},
-        "tilt_spread_deg": found.tilt_spread_deg,
-        "board": document_of(Board, board, dictionary=DICTIONARY),
-        "views": [_view(view) for view in found.views],
+        "summary": f"{used} of {len(found.views)} photos used, reprojection error {found.rms_px:.3f} px, "
+        f"focal length {found.camera.fx_px:.1f} ± {found.sigma.fx_px:.1f} px, "
+        f"{found.coverage.share:.0%} of the image covered",
+        **asdict(found),
     }
-
-
-def _camera(found: CameraCalibration) -> CalibratedCamera:
-    return {
-        "width_px": found.width_px,
-        "height_px": found.height_px,
-        "fx_px": found.parameters["fx_px"],
-        "fy_px": found.parameters["fy_px"],
-        "cx_px": found.parameters["cx_px"],
-        "cy_px": found.parameters["cy_px"],
-        "distortion": list(found.distortion),
-    }
-
-
-def _sigma(found: CameraCalibration) -> CameraSigma:
-    return {
-        "fx_px": found.sigma["fx_px"],
-        "fy_px": found.sigma["fy_px"],
-        "cx_px": found.sigma["cx_px"],
-        "cy_px": found.sigma["cy_px"],
-        "distortion": list(found.distortion_sigma),
-    }
-
-
-def _view(view: ViewReport) -> CalibrationView:
-    figures = {name: _rounded(getattr(view, name)) for name in ("rms_px", "tilt_deg", "edge_width_px")}
-    reason, detail = str(view.fault) if view.fault is not None else None, view.detail or None
-    return document_of(CalibrationView, view, used=view.fault is None, reason=reason, detail=detail, **figures)
-
-
-def _rounded(figure: float | None) -> float | None:
-    return None if figure is None else round(figure, 3)
 
 
 def _check_count(photos: tuple[tuple[str, SpooledFile], ...]) -> None:

@@ -8,7 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field, JsonValue
 from typing_extensions import TypedDict
 
+from app.calibration.board_view import CalibratedCamera, Coverage, Intrinsics, ViewReport
 from app.markers.snapshot import VERSION, Trust
+from app.sensors.camera import CalibrationBoard
 
 VehicleStatus = Literal["active", "retired"]
 
@@ -76,79 +78,21 @@ class VehicleVersionPage(TypedDict):
     items: list[VehicleVersionDocument]
 
 
-class CalibratedCamera(TypedDict):
-    """Intrinsics and distortion, in the members of a decode's camera; pixel centres at integers."""
-
-    width_px: int
-    height_px: int
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: list[float]
-
-
-class CameraSigma(TypedDict):
-    """Standard deviations of the parameters."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: list[float]
-
-
-class Coverage(TypedDict):
-    """Cells of the image, 6 rows of 8, that have a corner in them."""
-
-    share: float
-    cells: list[list[int]]
-
-
-class Board(TypedDict):
-    """A calibration board."""
-
-    columns: int
-    rows: int
-    square_mm: float
-    marker_mm: float
-    dictionary: str
-
-
-class CalibrationView(TypedDict):
-    """A photo: whether it was used, or the reason why it was not."""
-
-    photo: int
-    name: str
-    used: bool
-    reason: str | None
-    detail: str | None
-    corners: int
-    rms_px: float | None
-    tilt_deg: float | None
-    edge_width_px: float | None
-
-
-class CalibrationResult(TypedDict):
-    """What is stored of a calibration."""
-
-    decoder: str
-    summary: str
-    camera: CalibratedCamera
-    sigma: CameraSigma
-    rms_px: float
-    coverage: Coverage
-    tilt_spread_deg: float
-    board: Board
-    views: list[CalibrationView]
-
-
-class CalibrationDocument(CalibrationResult):
+class CalibrationDocument(TypedDict):
     """A calibrated camera."""
 
     id: str
     created_at: datetime
     who: str
+    decoder: str
+    summary: str
+    camera: CalibratedCamera
+    sigma: Annotated[Intrinsics, Field(description="Standard deviations of the parameters.")]
+    rms_px: Annotated[float, Field(description="Reprojection error over all views. [px]")]
+    coverage: Coverage
+    tilt_spread_deg: Annotated[float, Field(description="Largest angle between two views of the board. [deg]")]
+    board: CalibrationBoard
+    views: list[ViewReport]
 
 
 class CalibrationPage(TypedDict):

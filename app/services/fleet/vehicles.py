@@ -101,7 +101,7 @@ class VehicleProfile(Profile):
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
 
-def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) -> tuple[Object, dict[str, str]]:
+def inherit(profile: Object, stated: Object, kind: str) -> tuple[Object, dict[str, str]]:
     """Complete what an upload states from the vehicle's profile.
 
     Parameters
@@ -167,7 +167,7 @@ def _fitting_camera(camera: Object, stated: Mapping[str, object]) -> Object:
     return camera
 
 
-def _merge(ours: Object, stated: Mapping[str, Any], sources: dict[str, str], path: str = "") -> Object:
+def _merge(ours: Object, stated: Object, sources: dict[str, str], path: str = "") -> Object:
     merged: Object = {}
     for name in {**ours, **stated}:
         at, is_stated = f"{path}{name}", name in stated
@@ -442,7 +442,7 @@ def _holder(connection: sa.Connection, caller: Caller, key_id: str) -> str:
     return holder_id
 
 
-def _check_calibrated(connection: sa.Connection, caller: Caller, profile: dict[str, Any]) -> None:
+def _check_calibrated(connection: sa.Connection, caller: Caller, profile: Object) -> None:
     """A camera that names its calibration has the calibration's figures."""
     camera = profile.get("camera") or {}
     calibration_id = camera.get("calibration_id")

@@ -173,7 +173,7 @@ def test_packets_give_the_same_verdicts_markers_and_lane(real_server: LiveServer
         packets = number_entries([*later.packets, *again])
         online = decoded(client, packed(later, packets))
 
-    files = read_drive("drive.zip", SpooledFile.of(packed(later, packets)), {})
+    files = read_drive("drive.zip", SpooledFile.of(packed(later, packets)))
     known = snapshot.known_cerpms(list_numbers(files.packets))
     freshness = FreshnessRules(uploaded_at_s=datetime.now(UTC).timestamp())
     verification, merged = match_known_markers(files.packets, built.keys, known, files.track, freshness)

@@ -20,7 +20,7 @@ def compiled():
 
 compile_traces()
 before = compiled()
-decode_recording("drive.zip", SpooledFile.of(Path("docs/images/drive.zip").read_bytes()), {})
+decode_recording("drive.zip", SpooledFile.of(Path("docs/images/drive.zip").read_bytes()))
 print(before, compiled())
 """
 
