@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NotRequired, cast
 from pydantic import Discriminator, Field, JsonValue
 from typing_extensions import TypeAliasType, TypedDict
 
-from app.registry.decodes import DecodeRow
+from app.registry.decodes import DecodeRow, StoredResult
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
 from app.services.decodes.frame_documents import FramesResult
@@ -112,7 +112,7 @@ def _file_name(context: Mapping[str, Any]) -> str | None:
     return context.get("file_name") or declared.get("file_name")
 
 
-def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:
+def _links(path: str, kind: str, result: StoredResult) -> DecodeLinks:
     links: DecodeLinks = {"self": path}
     frames = [frame["frame"] for frame in result.get("frames", ()) if frame["error"] is None]
     if kind in (DecodeKind.FRAME, DecodeKind.ARCHIVE):
