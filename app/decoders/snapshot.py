@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsInt
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,7 @@ _GEOD = Geod(ellps="WGS84")
 _M_PER_DEG = 110_574.0  # [m] least length of a degree of latitude; source: WGS 84 at the equator
 _CLOCK_SLACK = timedelta(minutes=10)  # that a vehicle's clock may be slow
 _KM_H = {"km/h": 1.0, "mph": 1.609344}
+_Columns = dict[str, Any]  # arrays or values, by the names of `app.markers.snapshot.COLUMNS`
 _CURE = "fetch the snapshot again"
 
 
@@ -96,7 +97,7 @@ class Snapshot:
     """The markers of an area, verified. `open_snapshot` makes one."""
 
     def __init__(
-        self, header: Any, columns: dict[str, Any], kinds: list[dict[str, Any]], codes: bytes, books: list[Any]
+        self, header: np.void, columns: _Columns, kinds: list[dict[str, Any]], codes: bytes, books: list[Any]
     ) -> None:
         self.version = int(header["version"])
         self.made_at_ms = int(header["made_at_ms"])
@@ -122,7 +123,7 @@ class Snapshot:
         """The agency's codebooks: what tags look like, and what their codes mean."""
         return tuple(Codebook.from_document(book) for book in self._books)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """What it holds, as plain values: whose, where, from when to when, and how many of what."""
         families = {name: self._family == name for name in sorted({kind["family"] for kind in self._kinds})}
         heard = self._columns["flags"] & layout.HEARD_FLAG != 0
@@ -242,7 +243,7 @@ class Snapshot:
             earlier_spans=_heard_before(column),
         )
 
-    def _lane_start_deg(self, column: Mapping[str, Any]) -> tuple[float, float] | None:
+    def _lane_start_deg(self, column: _Columns) -> tuple[float, float] | None:
         if self._kinds[int(column["kind"])].get("scheme") != "information-tag":
             return None
         steps = int(column["lane_lon_step"]), int(column["lane_lat_step"])
@@ -299,7 +300,7 @@ def open_snapshot(data: bytes, trust: layout.Trust, now: datetime, *, newest_mad
     return _read(header, signed[header.dtype.itemsize :])
 
 
-def _header(data: bytes) -> Any:
+def _header(data: bytes) -> np.void:
     if data[:8] != layout.MAGIC[: len(data)] or not data:
         raise layout.NoSnapshot("this is no snapshot", limit=f"begins with {layout.MAGIC.decode()}", cure=_CURE)
     version = int.from_bytes(data[8:10], "little") if len(data) >= 10 else layout.VERSION
@@ -309,14 +310,14 @@ def _header(data: bytes) -> Any:
     if version < layout.VERSION:
         raise layout.OldSnapshot(message, limit=limit, cure="update the server, and fetch the snapshot again")
     least = layout.HEADER.itemsize + layout.SIGNATURE_BYTES
-    header = np.frombuffer(data, dtype=layout.HEADER, count=1)[0] if len(data) >= least else None
+    header: np.void | None = np.frombuffer(data, dtype=layout.HEADER, count=1)[0] if len(data) >= least else None
     wanted = least + int(header["body_bytes"]) if header is not None else least
     if header is None or len(data) != wanted:
         raise layout.TruncatedSnapshot(f"the snapshot has {len(data)} bytes", limit=f"{wanted} bytes", cure=_CURE)
     return header
 
 
-def _check_time(header: Any, now: datetime) -> None:
+def _check_time(header: np.void, now: datetime) -> None:
     now_s, expires_at_s, made_at_ms = now.timestamp(), int(header["expires_at_s"]), int(header["made_at_ms"])
     if now_s >= expires_at_s:
         raise layout.ExpiredSnapshot(
@@ -332,7 +333,7 @@ def _check_time(header: Any, now: datetime) -> None:
         )
 
 
-def _read(header: Any, packed: bytes) -> Snapshot:
+def _read(header: np.void, packed: bytes) -> Snapshot:
     count = int(header["markers"])
     kinds_bytes, codes_bytes, books_bytes = (int(header[f"{name}_bytes"]) for name in ("kinds", "codes", "books"))
     size = count * layout.ROW_BYTES + kinds_bytes + codes_bytes + books_bytes
@@ -377,18 +378,15 @@ def _registered(marker: SnapshotMarker) -> RegisteredMarker:
     )
 
 
-def _heard_before(column: Mapping[str, Any]) -> SequenceSpan | None:
+def _heard_before(column: _Columns) -> SequenceSpan | None:
     if not column["flags"] & layout.HEARD_FLAG:
         return None
-    times_s = (math.nan if int(ms) == layout.NO_TIME else int(ms) / 1000 for ms in _times_ms(column))
+    heard_ms = int(column["first_heard_ms"]), int(column["last_heard_ms"])
+    times_s = (math.nan if ms == layout.NO_TIME else ms / 1000 for ms in heard_ms)
     return SequenceSpan(int(column["first_sequence"]), int(column["last_sequence"]), *times_s)
 
 
-def _times_ms(column: Mapping[str, Any]) -> tuple[Any, Any]:
-    return column["first_heard_ms"], column["last_heard_ms"]
-
-
-def _value(steps: Any, step: float) -> float | None:
+def _value(steps: SupportsInt, step: float) -> float | None:
     return None if int(steps) == layout.NO_RMSE else round(int(steps) * step, 6)
 
 

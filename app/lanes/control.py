@@ -119,15 +119,19 @@ def follow_path(path_enu_m: npt.ArrayLike, *, field: str = "path_enu_m") -> Foll
     length = float(chainage[-1])
     if not SHORTEST_M <= length <= LONGEST_M:
         raise InvalidParameter(
-            f"{field} is {length:.1f} m long", field=field, limit=f"{SHORTEST_M:g} to {LONGEST_M:g} m",
+            f"{field} is {length:.1f} m long",
+            field=field,
+            limit=f"{SHORTEST_M:g} to {LONGEST_M:g} m",
             cure="decode a longer stretch of the lane",
-        )  # fmt: skip
+        )
     if steps.max() > MAX_GAP_M:
         at = chainage[int(steps.argmax())]
         raise InvalidParameter(
-            f"{field} has no point for {steps.max():.1f} m from {at:.1f} m on", field=field, limit=f"{MAX_GAP_M:g} m",
+            f"{field} has no point for {steps.max():.1f} m from {at:.1f} m on",
+            field=field,
+            limit=f"{MAX_GAP_M:g} m",
             cure="leave out unknown stretches of the path, or split it there",
-        )  # fmt: skip
+        )
     count = max(round(length / STEP_M), 1) + 1
     grid = np.linspace(0.0, length, count)
     even = np.column_stack([np.interp(grid, chainage, points[:, k]) for k in (0, 1)])
@@ -151,9 +155,11 @@ def _check_turns(points: Floats, chainage: Floats, field: str) -> None:
     turn_deg = abs(math.degrees(turned[worst]))
     if turn_deg > MAX_TURN_DEG:
         raise InvalidParameter(
-            f"{field} jumps: it turns by {turn_deg:.0f} degrees at {at[worst + 1]:.0f} m", field=field,
-            limit=f"{MAX_TURN_DEG:g} deg from one metre to the next", cure="split the path there",
-        )  # fmt: skip
+            f"{field} jumps: it turns by {turn_deg:.0f} degrees at {at[worst + 1]:.0f} m",
+            field=field,
+            limit=f"{MAX_TURN_DEG:g} deg from one metre to the next",
+            cure="split the path there",
+        )
 
 
 def _chord_headings(points: Floats, reach: int) -> Floats:

@@ -259,9 +259,11 @@ def _field_of_view(camera: Camera) -> Floats:
         back = _project(np.column_stack([ideal, np.ones(len(ideal))]), camera)
         if not np.abs(back - border).max() < _MAX_BORDER_ERROR_PX:
             raise InvalidParameter(
-                "the distortion folds the camera's own picture over", field="camera.distortion",
-                limit="one direction for each pixel", cure="check the coefficients and their order: k1, k2, p1, p2, k3",
-            )  # fmt: skip
+                "the distortion folds the camera's own picture over",
+                field="camera.distortion",
+                limit="one direction for each pixel",
+                cure="check the coefficients and their order: k1, k2, p1, p2, k3",
+            )
     margin = _VIEW_MARGIN * np.ptp(ideal, axis=0)
     (x0, y0), (x1, y1) = ideal.min(axis=0) - margin, ideal.max(axis=0) + margin
     return np.array([[1, 0, -x0], [-1, 0, x1], [0, 1, -y0], [0, -1, y1]], float)

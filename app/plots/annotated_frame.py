@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from app.lanes.overlay import LaneInFrame
 
+Pixels = npt.NDArray[np.uint8]
 _BGR = {"read": (80, 220, 60), "unsure": (40, 190, 250), "not-in-registry": (40, 190, 250)}
 _REFUSED_BGR = (90, 90, 240)
 _DARK_BGR = (25, 25, 25)
@@ -28,7 +29,7 @@ class Outline:
     label: str
 
 
-def draw_outlines(pixels: npt.NDArray[np.uint8], outlines: Sequence[Outline]) -> npt.NDArray[np.uint8]:
+def draw_outlines(pixels: Pixels, outlines: Sequence[Outline]) -> Pixels:
     """Plate outlines with their label: green what was read, amber what was unsure, red what was refused.
 
     Parameters
@@ -42,7 +43,7 @@ def draw_outlines(pixels: npt.NDArray[np.uint8], outlines: Sequence[Outline]) ->
     ndarray of uint8, shape (H, W, 3)
         A copy. BGR.
     """
-    canvas = np.array(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if pixels.ndim == 2 else pixels, dtype=np.uint8)
+    canvas = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if pixels.ndim == 2 else pixels.copy(), np.uint8)
     scale = max(min(canvas.shape[:2]) / 1080, 0.4)
     for row, outline in enumerate(outlines):
         colour = _BGR.get(outline.outcome, _REFUSED_BGR)
@@ -52,7 +53,7 @@ def draw_outlines(pixels: npt.NDArray[np.uint8], outlines: Sequence[Outline]) ->
     return canvas
 
 
-def draw_lane(pixels: npt.NDArray[np.uint8], lane: LaneInFrame) -> npt.NDArray[np.uint8]:
+def draw_lane(pixels: Pixels, lane: LaneInFrame) -> Pixels:
     """A frame with the lane over it: its area green, left boundary blue, right boundary orange, centre line white.
 
     Parameters
@@ -92,7 +93,7 @@ def _fixed(points_px: list[list[float]]) -> npt.NDArray[np.int32]:
     return np.asarray(np.round(np.asarray(points_px) * 16), np.int32).reshape(-1, 1, 2)
 
 
-def encode_picture(pixels: npt.NDArray[np.uint8], suffix: str) -> bytes:
+def encode_picture(pixels: Pixels, suffix: str) -> bytes:
     """A picture as ``png`` or ``jpg``."""
     options = [cv2.IMWRITE_JPEG_QUALITY, 90] if suffix == "jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
     _ok, encoded = cv2.imencode(f".{suffix}", pixels, options)
@@ -100,7 +101,7 @@ def encode_picture(pixels: npt.NDArray[np.uint8], suffix: str) -> bytes:
 
 
 def _draw_corners(
-    canvas: npt.NDArray[np.uint8], corners_px: Sequence[tuple[float, float]], colour: tuple[int, int, int], scale: float
+    canvas: Pixels, corners_px: Sequence[tuple[float, float]], colour: tuple[int, int, int], scale: float
 ) -> None:
     bound = 4 * max(canvas.shape[:2])  # corners of a plate half out of view lie outside, but not without end
     points = np.clip(np.array(corners_px, dtype=float), -bound, bound)
@@ -111,9 +112,7 @@ def _draw_corners(
     cv2.circle(canvas, centre, max(3, round(5 * scale)) * 16, colour, cv2.FILLED, cv2.LINE_AA, 4)
 
 
-def _draw_label(
-    canvas: npt.NDArray[np.uint8], outline: Outline, colour: tuple[int, int, int], scale: float, row: int
-) -> None:
+def _draw_label(canvas: Pixels, outline: Outline, colour: tuple[int, int, int], scale: float, row: int) -> None:
     height, width = canvas.shape[:2]
     font, size, thick = cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, max(1, round(2 * scale))
     (text_width, text_height), _base = cv2.getTextSize(outline.label, font, size, thick)

@@ -51,6 +51,10 @@ observations = sa.Table(
 )
 
 
+StoredResult = Mapping[str, Any]
+"""The result of a decode, or a part of it, as JSON."""
+
+
 class DecodeRow(NamedTuple):
     """A decode with the state of its job."""
 

@@ -23,10 +23,17 @@ def write_csv(track: Track) -> str:
     rows = [",".join(CSV_COLUMNS)]
     stamps = time_texts(track.time_s)
     columns = zip(
-        stamps, track.lon_deg.tolist(), track.lat_deg.tolist(), track.heading_deg.tolist(), track.speed_m_s.tolist(),
-        track.covariance_m2.tolist(), track.sigma_m.tolist(), track.heading_sigma_deg.tolist(), track.in_gap.tolist(),
+        stamps,
+        track.lon_deg.tolist(),
+        track.lat_deg.tolist(),
+        track.heading_deg.tolist(),
+        track.speed_m_s.tolist(),
+        track.covariance_m2.tolist(),
+        track.sigma_m.tolist(),
+        track.heading_sigma_deg.tolist(),
+        track.in_gap.tolist(),
         strict=True,
-    )  # fmt: skip
+    )
     for time, lon, lat, heading, speed, (east, cross, north), sigma, heading_sigma, gap in columns:
         rows.append(
             f"{time},{lon:.9f},{lat:.9f},{heading:.4f},{speed:.3f},{east:.6g},{cross:.6g},{north:.6g},{sigma:.4f},"
@@ -42,19 +49,24 @@ def write_geojson(track: Track, name: str, markers: Sequence[DriveMarker] = ()) 
     for part in stretches(track):
         if len(part) < 2:
             continue
-        features.append({
-            "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": _coordinates(track.lon_deg[part], track.lat_deg[part])},
-            "properties": {
-                "kind": "gap" if bool(track.in_gap[part[1:]].all()) else "track",
-                "name": name,
-                "times": [stamps[k] for k in part],
-                "heading_deg": np.round(track.heading_deg[part], 4).tolist(),
-                "speed_m_s": np.round(track.speed_m_s[part], 3).tolist(),
-                "covariance_m2": np.round(track.covariance_m2[part], 8).tolist(),
-                "heading_sigma_deg": np.round(track.heading_sigma_deg[part], 4).tolist(),
-            },
-        })  # fmt: skip
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {
+                    "type": "LineString",
+                    "coordinates": _coordinates(track.lon_deg[part], track.lat_deg[part]),
+                },
+                "properties": {
+                    "kind": "gap" if bool(track.in_gap[part[1:]].all()) else "track",
+                    "name": name,
+                    "times": [stamps[k] for k in part],
+                    "heading_deg": np.round(track.heading_deg[part], 4).tolist(),
+                    "speed_m_s": np.round(track.speed_m_s[part], 3).tolist(),
+                    "covariance_m2": np.round(track.covariance_m2[part], 8).tolist(),
+                    "heading_sigma_deg": np.round(track.heading_sigma_deg[part], 4).tolist(),
+                },
+            }
+        )
     features += [_marker_feature(marker) for marker in markers]
     return json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), allow_nan=False)
 

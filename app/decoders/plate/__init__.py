@@ -5,4 +5,9 @@ that are read, digits that are wrong, positions and times. `python -m benchmarks
 of acceptance out one by one.
 """
 
+from typing import Any
+
+import numpy.typing as npt
+
 DECODER_VERSION = "plate/7"
+Array = npt.NDArray[Any]  # of whatever numbers

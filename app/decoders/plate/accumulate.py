@@ -11,10 +11,8 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
 from app.decoders.plate.marker_colours import MIN_MARGIN, find_wrong_colour
@@ -50,7 +48,6 @@ MISSING_SHARE = 0.5
 """[1] share of the nearer half of the frames that must lack a part of a plate for it to be missing."""
 FIXED = 1e-4
 """[contrast] spread of the joint contrast, which is 1 by construction."""
-Array = npt.NDArray[Any]
 
 
 def count_effective(frames: int) -> float:

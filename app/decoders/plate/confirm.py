@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from app.decoders.plate import Array
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 
@@ -17,8 +17,6 @@ from app.markers.reading import PlateOutcome, PlateReading
 #
 # A server adds up frames, so nothing here is compiled.
 
-
-Array = npt.NDArray[Any]
 
 CLEAN, STAINED, STAINED_SHARE = (1e-4, 1e-5), (0.1, 0.05), 0.02
 """[probability] of a smooth stain and of a spot on a unit of a clean and of a stained plate, and of a stained plate."""

@@ -6,12 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from app.compiled import ieee_kernel
+from app.decoders.plate import Array
 from app.decoders.plate.confirm import UnitVerification
 from app.decoders.plate.unit_likelihoods import MAX_LEVEL_RESIDUAL, UnitEvidence, pattern_cost
 from app.markers.plate import (
@@ -39,7 +40,6 @@ from app.markers.plate import (
 # Trans. Inf. Theory 41 (1995), here of order 2 and over GF(16).
 
 
-Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 Symbols = npt.NDArray[np.uint8]
 

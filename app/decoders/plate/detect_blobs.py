@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from app.compiled import ieee_kernel, ieee_loop, ieee_loop_kernel, kernel, step, trailing_zeros
+from app.decoders.plate import Array
 
 # === Signals of red and green in a frame, at half resolution and coarser.
 #
@@ -30,7 +31,6 @@ COARSE_RATIO_LEVELS = ((3, 0), (7, 0))
 NOISE_FACTOR = 3.5
 """[1] threshold over the mean difference of neighbours around a block, which foliage and grass have everywhere."""
 
-Array = npt.NDArray[Any]
 Grey = npt.NDArray[np.uint8]
 Signal = npt.NDArray[np.int16]
 
@@ -49,11 +49,11 @@ class Planes:
 class MarkerSignal:
     """Where a frame is red (positive) or green (negative)."""
 
-    opponent: npt.NDArray[Any]  # int16, shape (H // scale, W // scale): strength of the colour
+    opponent: Array  # int16, shape (H // scale, W // scale): strength of the colour
     planes: Planes  # [grey levels] the scaled frame
     # int16, shape (H // scale, blocks): strongest signal in every run of `BLOCK` pixels of a row
-    peak: npt.NDArray[Any]
-    threshold: npt.NDArray[Any]  # int16, shape (blocks, blocks): signal that exceeds the roughness around a block
+    peak: Array
+    threshold: Array  # int16, shape (blocks, blocks): signal that exceeds the roughness around a block
     # thresholds at which blobs are cut out: strength, and share of the brightness in 32nds
     levels: tuple[tuple[int, int], ...]
     scale: int = 2  # pixels of the frame that make one of the signal, along a side

@@ -7,18 +7,14 @@ the one that explains most of the pixels' variance is taken.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from app.decoders.plate import Array
 from app.decoders.plate.fit import PlateFit, fit_plate
 from app.decoders.plate.pose import marker_centroids
 from app.markers.plate import PlateGeometry
-
-Frame = npt.NDArray[Any]
-Array = npt.NDArray[Any]
 
 TRAILS_PX = (0.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0, 11.0)
 """[px] trails that are tried. Source: 6 to 12 ms at 10 to 30 km/h are 17 to 100 mm, that is 0.8 to 12 px on plates of
@@ -56,12 +52,12 @@ four wrong frames of one drive in `python -m benchmarks.plates --sets thermal`, 
 class WarmFrame:
     """A thermal frame, and by the place of each trail the frame without it and its warm quadrangles, made once."""
 
-    def __init__(self, image: Frame) -> None:
+    def __init__(self, image: Array) -> None:
         self._image = image
-        self._inverted: dict[int, Frame] = {}
+        self._inverted: dict[int, Array] = {}
         self._quads: dict[int, list[Array]] = {}
 
-    def inverted(self, trail: int) -> Frame:
+    def inverted(self, trail: int) -> Array:
         """The frame without a trail, bright where it was cool."""
         if trail not in self._inverted:
             self._inverted[trail] = cv2.bitwise_not(without_trail(self._image, TRAILS_PX[trail]))
@@ -103,7 +99,7 @@ def orientation_evidence(fits: Sequence[PlateFit]) -> float:
     return 0.5 * fits[0].pixels * float(np.log(ratio)) if ratio >= MIN_MISFIT_RATIO else 0.0
 
 
-def _fit_turned(inverted: Frame, corners: Array, geometry: PlateGeometry) -> list[PlateFit]:
+def _fit_turned(inverted: Array, corners: Array, geometry: PlateGeometry) -> list[PlateFit]:
     """Fits in the four orientations, the best first."""
     centroids = _centroids(corners, geometry)
     turned = (fit_plate(inverted, np.roll(centroids, turn, axis=0), geometry, linear=True) for turn in range(4))
@@ -123,7 +119,7 @@ def _best_trail(frame: WarmFrame, trail: int, fit: PlateFit, geometry: PlateGeom
     return trail
 
 
-def without_trail(image: Frame, trail_px: float) -> Frame:
+def without_trail(image: Array, trail_px: float) -> Array:
     """A frame without the trail that a slow sensor draws behind what moves down through the image.
 
     Parameters
@@ -157,7 +153,7 @@ def _centroids(corners_px: Array, geometry: PlateGeometry) -> Array:
     return centroids
 
 
-def detect_warm_quads(image: Frame) -> list[Array]:
+def detect_warm_quads(image: Array) -> list[Array]:
     """Corners of warm quadrangles, clockwise in the image, shape (4, 2) each. [px]"""
     height, width = image.shape
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
@@ -181,7 +177,7 @@ def detect_warm_quads(image: Frame) -> list[Array]:
     return _distinct(quads)
 
 
-def _quad_around(contour: npt.NDArray[Any]) -> tuple[float, Array] | None:
+def _quad_around(contour: Array) -> tuple[float, Array] | None:
     """Quadrangle around a region with its score, the larger and more solid the better; None where there is none."""
     extent = np.ptp(contour[:, 0], axis=0)
     if extent.min() < MIN_EXTENT_PX or len(contour) < MIN_CONTOUR:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from app.decoders.plate import Array
 from app.decoders.plate.confirm import UnitVerification
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
 from app.decoders.plate.marker_colours import MarkerColours
@@ -57,7 +56,6 @@ that its confidence is, and how often the probability of no error by the pixels 
 readings 94, 89, 92 and 78 % are right at an error of up to 1e-3, 0.01, 0.03 and 0.1 by the pixels (record 0011)."""
 SURE_CELL = 0.9
 """[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`."""
-Array = npt.NDArray[Any]
 Verify = Callable[[PlateCode], UnitVerification | None]
 """Compares the pixels of a plate with a code; None where it has too few."""
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from app.compiled import ieee_routine, kernel, routine, step
+from app.decoders.plate import Array
 from app.decoders.plate.hypotheses import cut_patch
 from app.decoders.plate.normal_equations import (
     NormalEquations,
@@ -357,8 +358,6 @@ def minimize(patch: PlatePatch, model: PlateModel, equations: NormalEquations, s
 # === Analysis by synthesis.
 
 
-Array = npt.NDArray[Any]
-
 FIRST_BLUR = 0.2
 """[units] blur to begin with. An edge is then felt from half a unit away."""
 FIRST_BLUR_PX = (0.7, 2.5)
@@ -431,9 +430,7 @@ class CoarseFit(NamedTuple):
         return plate_from_image(self.model.pose, self.model.frame)
 
 
-def fit_plate(
-    image: npt.NDArray[Any], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
-) -> PlateFit | None:
+def fit_plate(image: Array, centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False) -> PlateFit | None:
     """Fit a plate whose marker centroids are roughly known.
 
     Parameters
@@ -455,7 +452,7 @@ def fit_plate(
 
 
 def fit_coarsely(
-    image: npt.NDArray[Any], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
+    image: Array, centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
 ) -> CoarseFit | None:
     """First stage of `fit_plate`; most of what is no plate is given up here."""
     model = _start_model(centroids_px, geometry)
@@ -466,9 +463,7 @@ def fit_coarsely(
     return CoarseFit(model, equations, quality.explained) if quality.is_plate else None
 
 
-def finish_fit(
-    image: npt.NDArray[Any], coarse: CoarseFit, geometry: PlateGeometry, *, linear: bool = False
-) -> PlateFit | None:
+def finish_fit(image: Array, coarse: CoarseFit, geometry: PlateGeometry, *, linear: bool = False) -> PlateFit | None:
     """Second stage of `fit_plate`; it moves the model of the first."""
     model, equations, _explained = coarse
     quality = _run_stage(image, model, equations, _THERMAL_FINE if linear else _FINE, linear)
@@ -478,9 +473,7 @@ def finish_fit(
     return _result(model, covariance, equations.misfit, quality) if covariance.size else None
 
 
-def _run_stage(
-    image: npt.NDArray[Any], model: PlateModel, equations: NormalEquations, stage: Stage, linear: bool
-) -> FitQuality:
+def _run_stage(image: Array, model: PlateModel, equations: NormalEquations, stage: Stage, linear: bool) -> FitQuality:
     """Cut the plate out of the image where the model has it, and move the model until its corners rest."""
     lost = FitQuality(False, 0.0, 0.0, 0)
     corners = np.empty((4, 2))
@@ -494,7 +487,7 @@ def _run_stage(
     return minimize(patch, model, equations, stage)
 
 
-def refine_corners(image: npt.NDArray[Any], fit: PlateFit, geometry: PlateGeometry) -> tuple[Array, Array] | None:
+def refine_corners(image: Array, fit: PlateFit, geometry: PlateGeometry) -> tuple[Array, Array] | None:
     """Corners of a fitted plate from more of its pixels, with the blur as the line of sight skews it.
 
     Parameters

@@ -6,12 +6,10 @@ compared with the frame, and the plate is fitted where the two agree best.
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from app.decoders.plate import Array
 from app.decoders.plate.evidence import PlateEvidence
 from app.decoders.plate.fit import fit_plate, project
 from app.decoders.plate.pose import marker_centroids
@@ -33,7 +31,6 @@ MIN_EXPLAINED = 0.85
 SMOOTHING = 0.4
 """[px] blur of the warped image, for each pixel of the smaller one."""
 _UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-Array = npt.NDArray[Any]
 
 
 def predict_corners(pose: PlatePose, geometry: PlateGeometry, camera: Camera, advance_m: float) -> Array | None:

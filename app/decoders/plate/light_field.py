@@ -9,20 +9,19 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from app.compiled import kernel, loop, step
+from app.decoders.plate import Array
 from app.decoders.plate.hypotheses import PlatePixels
 from app.decoders.plate.normal_equations import factorize, invert, solve_factorized, substitute
 from app.decoders.plate.profiles import Floats as ProfilesFloats
 from app.decoders.plate.profiles import Ints
 from app.decoders.plate.unit_patterns import minimize_pattern
 from app.markers.plate import unit_index
-
-Array = npt.NDArray[Any]
 
 KNOT_MM = 20.0
 """[mm] distance of the knots between which the light is linear."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from app.decoders.plate import Array
 from app.geodesy import enu_from_heading, wgs84_from_enu
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlatePose, PlateReading
@@ -64,8 +64,6 @@ def unit_shapes(n: int) -> npt.NDArray[np.int64]:
 
 # === Corners and camera to the pose of the plate, and that to position and heading of the vehicle.
 
-
-Array = npt.NDArray[Any]
 
 LEVEL_SPREAD_RAD = math.radians(0.4)
 """[rad] standard deviation of a vehicle's roll and pitch relative to the road. The simulated vehicles have 0.15 degrees

@@ -11,12 +11,13 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from app.decoders.plate import Array
 from app.decoders.plate.confirm import UnitVerification
 from app.decoders.plate.fit import PlateFit
 from app.decoders.plate.hypotheses import (
@@ -44,8 +45,6 @@ from app.decoders.plate.pose import unit_edges, unit_shapes
 from app.decoders.plate.synthesis import FIRST_GAP, gather_shares, set_pixel_shares
 from app.decoders.plate.unit_patterns import cell_costs, minimize_pattern
 from app.markers.plate import PlateCode, PlateGeometry, unit_index
-
-Array = npt.NDArray[Any]
 
 CONTRAST = 2.0
 """[log light] expected difference of light and dark units once haze is taken off. Near ln(1 / light_field.DARK_SHARE) =

@@ -16,7 +16,7 @@ from app.markers.cerpm import MESSAGE_BYTES
 from app.registry import decodes as store
 from app.registry.audit import Author
 from app.registry.database import Database
-from app.registry.decodes import DecodeFilter, DecodeRow
+from app.registry.decodes import DecodeFilter, DecodeRow, StoredResult
 from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
@@ -326,7 +326,7 @@ def _upload_key(row: DecodeRow) -> str:
     return row.upload_key
 
 
-def _packets(packets: Sequence[ReceivedPacket], track: PoseTrack | None, result: Mapping[str, Any]) -> PacketsDocument:
+def _packets(packets: Sequence[ReceivedPacket], track: PoseTrack | None, result: StoredResult) -> PacketsDocument:
     """Columns of packets, of many evenly chosen ones."""
     times_s = np.array([packet.received_at_s for packet in packets], float)
     order = np.argsort(times_s, kind="stable")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from datetime import datetime
-from typing import Annotated, Any, Literal, NotRequired, cast
+from typing import Annotated, Literal, NotRequired, cast
 
 from pydantic import Discriminator, Field, JsonValue
 from typing_extensions import TypeAliasType, TypedDict
 
-from app.registry.decodes import DecodeRow
+from app.registry.decodes import DecodeRow, StoredResult
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
 from app.services.decodes.frame_documents import FramesResult
@@ -107,7 +106,7 @@ def decode_head(row: DecodeRow) -> DecodeHead:
     }
 
 
-def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:
+def _links(path: str, kind: str, result: StoredResult) -> DecodeLinks:
     links: DecodeLinks = {"self": path}
     frames = [frame["frame"] for frame in result.get("frames", ()) if frame["error"] is None]
     if kind in (DecodeKind.FRAME, DecodeKind.ARCHIVE):

@@ -24,12 +24,13 @@ from app.markers.reading import PlateOutcome
 from app.services.decodes.context import count_of
 from app.services.decodes.frame_poses import FramePose, GapDocument, ReceiverPositions
 from app.services.decodes.matching import FRAME_READERS, Fix
-from app.services.documents import ErrorDocument, error_document
+from app.services.documents import ErrorDocument, document_of, error_document, rounded
 from app.services.health.record import FrameHealth
 
 if TYPE_CHECKING:  # it loads numba
     from app.decoders.plate.video_search import FoundPlate
 
+_PLACES = {"lon_deg": 9, "lat_deg": 9, "speed_m_s": 3}
 DECODER = f"waymark {__version__} {DECODER_VERSION}"
 
 
@@ -257,9 +258,11 @@ def seen_plate_document(plate: FoundPlate, frames: Mapping[int, ReadFrame]) -> S
         marker.match.row.id
         for seen in plate.seen
         for marker in frames[seen.frame].markers
-        if marker.reading.family == PLATE.name and marker.match is not None and marker.match.row is not None
+        if marker.reading.family == PLATE.name
+        and marker.match is not None
+        and marker.match.row is not None
         and getattr(marker.reading, "digits", None) == reading.digits
-    )  # fmt: skip
+    )
     return {
         "outcome": str(reading.outcome),
         "reason": reading.reason or None,
@@ -278,10 +281,6 @@ def _summary(frames: Sequence[ReadFrame], searched: int | None) -> FrameSummary:
     read = [marker for marker in markers if marker.reading.outcome == PlateOutcome.READ]
     matched = [marker for marker in read if marker.match is not None and marker.match.row is not None]
     failed = sum(frame.error is not None for frame in frames)
-    outcomes: dict[str, int] = {}
-    for marker in markers:
-        outcome = str(marker.reading.outcome)
-        outcomes[outcome] = outcomes.get(outcome, 0) + 1
     refused = len(markers) - len(read)
     text = f"{_counts(read)} read" if read else "no plate read"
     text += f" in {count_of(total, 'frame')}, {len(matched)} of them registered" if read else ""
@@ -294,7 +293,7 @@ def _summary(frames: Sequence[ReadFrame], searched: int | None) -> FrameSummary:
         "plates_read": sum(marker.reading.family == PLATE.name for marker in read),
         "plates_matched": sum(marker.reading.family == PLATE.name for marker in matched),
         "fixes": sum(frame.fix is not None for frame in frames),
-        "outcomes": outcomes,
+        "outcomes": Counter(str(marker.reading.outcome) for marker in markers),
     }
 
 
@@ -311,7 +310,7 @@ def _frame(frame: ReadFrame) -> FrameDocument:
         "name": frame.name,
         "captured_at": frame.captured_at.isoformat().replace("+00:00", "Z") if frame.captured_at else None,
         "time_s": None if frame.time_s is None else round(frame.time_s, 6),
-        "pose": _pose(frame.pose),
+        "pose": document_of(FramePoseDocument, rounded(frame.pose, _PLACES)) if frame.pose is not None else None,
         "error": error_document(frame.error) if frame.error else None,
         "width_px": header.width_px if header else None,
         "height_px": header.height_px if header else None,
@@ -322,19 +321,6 @@ def _frame(frame: ReadFrame) -> FrameDocument:
         "decode_ms": round(frame.decode_ms, 3),
         "readings": len(frame.markers),
         "fix": fix_document(frame.fix),
-    }
-
-
-def _pose(pose: FramePose | None) -> FramePoseDocument | None:
-    if pose is None:
-        return None
-    return {
-        "source": pose.source,
-        "lon_deg": round(pose.lon_deg, 9),
-        "lat_deg": round(pose.lat_deg, 9),
-        "heading_deg": pose.heading_deg,
-        "accuracy_m": pose.accuracy_m,
-        "speed_m_s": None if pose.speed_m_s is None else round(pose.speed_m_s, 3),
     }
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from app.formats.frame_list import FrameList, ListedFrame
 from app.formats.logs import LogReport, has_zone
 from app.formats.text import TableWriter
 from app.geodesy.frames import metres_per_radian
-from app.registry.decodes import DecodeRow
+from app.registry.decodes import DecodeRow, StoredResult
 from app.sensors.pose_track import PoseTrack
 from app.services.decodes.context import DecodeKind, DecodeTimes, clock_of, stamp
 from app.services.decodes.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
@@ -247,7 +247,12 @@ def find_gaps(times: Sequence[tuple[int, datetime | None]]) -> tuple[list[GapDoc
         return [], []
     usual = float(np.percentile(steps[steps > 0], 25, method="lower")) if (steps > 0).any() else 0.0
     gaps = [
-        _gap(known[k][0], known[k + 1][0], float(steps[k]), "no frames in between")
+        GapDocument(
+            after_frame=known[k][0],
+            before_frame=known[k + 1][0],
+            seconds=round(float(steps[k]), 3),
+            reason="no frames in between",
+        )
         for k in np.flatnonzero(steps > max(GAP_S, GAP_FACTOR * usual))
     ]
     warnings = []
@@ -270,10 +275,6 @@ def describe_report(name: str, report: LogReport) -> list[str]:
         first = report.left_out[0]
         notes.append(f"{name}: {report.left_out_count} rows were left out; row {first.entry}: {first.reason}")
     return notes
-
-
-def _gap(after: int, before: int, seconds: float, reason: str) -> GapDocument:
-    return {"after_frame": after, "before_frame": before, "seconds": round(seconds, 3), "reason": reason}
 
 
 def _track_of_list(listed: Mapping[str, ListedFrame]) -> PoseTrack | None:
@@ -404,23 +405,25 @@ def track_geojson(row: DecodeRow) -> TrackCollection:
     clock, features = clock_of(row), list[TrackFeature]()
     for part in _stretches(track_points(row)):
         coordinates = [[round(point.lon_deg, 9), round(point.lat_deg, 9)] for point in part]
-        features.append({
-            "type": "Feature",
-            "geometry": (
-                {"type": "LineString", "coordinates": coordinates}
-                if len(part) > 1
-                else {"type": "Point", "coordinates": coordinates[0]}
-            ),
-            "properties": {
-                "kind": "track",
-                "clock": clock.clock,
-                "times": [stamp(point.time_s, clock) for point in part],
-                "time_s": [point.time_s for point in part],
-                "source": [point.source for point in part],
-                "heading_deg": [point.heading_deg for point in part],
-                "sigma_m": [point.sigma_m for point in part],
-            },
-        })  # fmt: skip
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": (
+                    {"type": "LineString", "coordinates": coordinates}
+                    if len(part) > 1
+                    else {"type": "Point", "coordinates": coordinates[0]}
+                ),
+                "properties": {
+                    "kind": "track",
+                    "clock": clock.clock,
+                    "times": [stamp(point.time_s, clock) for point in part],
+                    "time_s": [point.time_s for point in part],
+                    "source": [point.source for point in part],
+                    "heading_deg": [point.heading_deg for point in part],
+                    "sigma_m": [point.sigma_m for point in part],
+                },
+            }
+        )
     return {"type": "FeatureCollection", "features": features}
 
 
@@ -453,7 +456,7 @@ def track_gpx(row: DecodeRow) -> str:
 # --- sources ----------------------------------------------------------------------------------------------------------
 
 
-def _of_frames(result: Mapping[str, Any], clock: DecodeTimes) -> Iterator[TrackPoint]:
+def _of_frames(result: StoredResult, clock: DecodeTimes) -> Iterator[TrackPoint]:
     """The fix of each frame, else its pose; a coarse position of the whole upload is none."""
     found = []
     for frame in result.get("frames", ()):
@@ -471,14 +474,14 @@ def _of_frames(result: Mapping[str, Any], clock: DecodeTimes) -> Iterator[TrackP
     yield from sorted(found, key=lambda point: (point.time_s is None, point.time_s or 0.0))
 
 
-def _of_receiver(result: Mapping[str, Any]) -> Iterator[TrackPoint]:
+def _of_receiver(result: StoredResult) -> Iterator[TrackPoint]:
     positions = result.get("receiver") or {}
     names = ("time_s", "lon_deg", "lat_deg", "accuracy_m")
     for time_s, lon_deg, lat_deg, accuracy_m in zip(*(positions.get(name, ()) for name in names), strict=True):
         yield TrackPoint(time_s, lon_deg, lat_deg, "receiver", None, accuracy_m)
 
 
-def _reckoned(result: Mapping[str, Any], clock: DecodeTimes) -> list[TrackPoint]:
+def _reckoned(result: StoredResult, clock: DecodeTimes) -> list[TrackPoint]:
     """Speed and heading over time, placed by the fixes at tags: between two, their disagreement is spread evenly."""
     fixes = sorted((tag["fix"] for tag in result.get("tags", ()) if tag.get("fix")), key=lambda fix: float(fix["t_s"]))
     motion = result.get("motion") or {}
@@ -518,7 +521,7 @@ def _column(values: Sequence[float | None], count: int) -> Floats:
     return column
 
 
-def _between_fixes(at_s: Floats, fixes: Sequence[Mapping[str, Any]]) -> Floats:
+def _between_fixes(at_s: Floats, fixes: Sequence[StoredResult]) -> Floats:
     """Headings of a recording without any: those of the fixes, and what lies between two; NaN far from all. [deg]"""
     fix_s = np.array([fix["t_s"] for fix in fixes], float)
     turned = np.unwrap([fix["heading_deg"] for fix in fixes], period=360.0)
@@ -526,7 +529,7 @@ def _between_fixes(at_s: Floats, fixes: Sequence[Mapping[str, Any]]) -> Floats:
     return np.where(near, np.interp(at_s, fix_s, turned) % 360.0, math.nan)
 
 
-def _of_fix(fix: Mapping[str, Any], clock: DecodeTimes) -> TrackPoint:
+def _of_fix(fix: StoredResult, clock: DecodeTimes) -> TrackPoint:
     sigma_m = math.hypot(fix["sigma"]["along_m"], fix["sigma"]["across_m"])
     return TrackPoint(
         clock.trace_s(float(fix["t_s"])), fix["lon_deg"], fix["lat_deg"], "fix", fix["heading_deg"], round(sigma_m, 4)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from typing import Any, Literal
+from typing import Literal
 
 from typing_extensions import TypedDict
 
@@ -15,7 +15,7 @@ from app.formats.text import TableWriter
 from app.plots.annotated_frame import Outline
 from app.registry import decodes as store
 from app.registry.database import Database
-from app.registry.decodes import DecodeRow
+from app.registry.decodes import DecodeRow, StoredResult
 from app.services.access.access import Caller
 from app.services.decodes.context import DecodeKind, DecodeRules, DecodeTimes, clock_of, stamp
 from app.services.decodes.declarations import DecodeContext
@@ -114,7 +114,7 @@ def _cell(value: object) -> object:
     return str(value).lower() if isinstance(value, bool) else value
 
 
-def _frame_readings(result: Mapping[str, Any], clock: DecodeTimes) -> Iterator[ReadingRow]:
+def _frame_readings(result: StoredResult, clock: DecodeTimes) -> Iterator[ReadingRow]:
     times = {frame["frame"]: clock.frame_s(frame) for frame in result.get("frames", ())}
     for reading in result.get("readings", ()):
         match, time_s = reading.get("match") or {}, times.get(reading["frame"])
@@ -135,7 +135,7 @@ def _frame_readings(result: Mapping[str, Any], clock: DecodeTimes) -> Iterator[R
         }
 
 
-def _tag(tag: Mapping[str, Any], clock: DecodeTimes) -> ReadingRow:
+def _tag(tag: StoredResult, clock: DecodeTimes) -> ReadingRow:
     match, fix = tag.get("match") or {}, tag.get("fix") or {}
     time_s = clock.trace_s(tag["end_s"])
     return {
@@ -155,7 +155,7 @@ def _tag(tag: Mapping[str, Any], clock: DecodeTimes) -> ReadingRow:
     }
 
 
-def _cerpm(marker: Mapping[str, Any]) -> ReadingRow:
+def _cerpm(marker: StoredResult) -> ReadingRow:
     return {
         "time": None,
         "time_s": None,
@@ -280,7 +280,7 @@ class DecodeOutputs:
         with self._database.read() as connection:
             return store.get_decode(connection, caller.agency_id, decode_id, holder_id=caller.own_key_id)
 
-    def _result(self, caller: Caller, decode_id: str) -> tuple[DecodeRow, dict[str, Any]]:
+    def _result(self, caller: Caller, decode_id: str) -> tuple[DecodeRow, StoredResult]:
         row = self._get(caller, decode_id)
         if row.result is None:
             raise NotFound(
@@ -295,7 +295,7 @@ class DecodeOutputs:
         return self._blobs.opened(row.upload_key)
 
 
-def _outline(reading: dict[str, Any]) -> Outline:
+def _outline(reading: StoredResult) -> Outline:
     corners = tuple((float(x), float(y)) for x, y in reading["corners_px"] or ())
     label = f"{reading['digits']} {reading['confidence']:.1%}" if reading["digits"] else reading["outcome"]
     return Outline(corners, reading["outcome"], label)

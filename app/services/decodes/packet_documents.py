@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -12,7 +11,7 @@ from typing_extensions import TypedDict
 from app import __version__
 from app.decoders.cerpm.merge import Disagreement, vehicle_positions
 from app.decoders.cerpm.signal import SignalProfile
-from app.decoders.cerpm.verify import Verdict
+from app.decoders.cerpm.verify import Verdict, VerifiedPacket
 from app.geodesy import LocalizationGrade
 from app.lanes.overlay import LaneInFrame
 from app.lanes.types import Lane
@@ -285,7 +284,7 @@ def _markers(read: ReadPackets, lane: Lane) -> list[ReceivedMarkerDocument]:
     merged = read.merged
     rows = {int(number): k for k, number in enumerate(merged.number)}
     off_line = {entry.number: entry for entry in lane.left_out}
-    claims: dict[int, list[Any]] = {}
+    claims: dict[int, list[VerifiedPacket]] = {}
     for packet in read.verification.packets:
         if packet.number is not None and (packet.accepted or packet.number in rows or packet.number in merged.left_out):
             claims.setdefault(packet.number, []).append(packet)
@@ -334,14 +333,13 @@ def _place(number: int, read: ReadPackets, k: int | None) -> tuple[float | None,
 
 
 def claimed_place(number: int, read: ReadPackets) -> tuple[float | None, float | None]:
-    """Position in the newest accepted packet of a marker, else in its last one in clear. [deg]"""
-    claim: Any = None
-    for packet in read.verification.packets:
-        if packet.number == number and packet.accepted and packet.message is not None:
-            if claim is None or packet.message.sequence >= getattr(claim, "sequence", -1):
-                claim = packet.message
-        elif packet.number == number and claim is None and packet.packet.claim is not None:
-            claim = packet.packet.claim
+    """Position in the newest accepted packet of a marker, else in its first one in clear. [deg]"""
+    own = [packet for packet in read.verification.packets if packet.number == number]
+    accepted = [packet.message for packet in own if packet.accepted and packet.message is not None]
+    if accepted:
+        newest = max(reversed(accepted), key=lambda message: message.sequence)
+        return newest.lon_deg, newest.lat_deg
+    claim = next((packet.packet.claim for packet in own if packet.packet.claim is not None), None)
     return (None, None) if claim is None else (claim.lon_deg, claim.lat_deg)
 
 

@@ -25,7 +25,7 @@ from app.registry import decodes as store
 from app.registry.audit import Author
 from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.decodes import DecodeRow, NewObservation
+from app.registry.decodes import DecodeRow, NewObservation, StoredResult
 from app.registry.health import NewUnregistered, add_unregistered
 from app.registry.jobs import JobKind, new_job
 from app.services.access.access import Caller
@@ -350,7 +350,7 @@ def _store_findings(
     upload: Upload,
     decode_id: str,
     decoded: Decoded,
-    result: Mapping[str, Any],
+    result: StoredResult,
     now: datetime,
 ) -> None:
     markers.add_spans(connection, upload.agency_id, decode_id, decoded.spans)

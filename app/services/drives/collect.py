@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -14,7 +14,7 @@ from pydantic import Field
 from app.errors import Conflict, InvalidParameter
 from app.geodesy import LocalizationGrade
 from app.inputs import Declaration, Identifier, Number, Text
-from app.registry.decodes import DecodeRow
+from app.registry.decodes import DecodeRow, StoredResult
 from app.services.decodes.context import DecodeKind
 from app.tracks import Clock, DriveMarker, LanePath, LeftOutReason, PositionFix, Samples, TrackInput
 from app.tracks.types import MAX_CLOCK_SIGMA_S
@@ -140,16 +140,7 @@ def _add_frames(found: Collected, row: DecodeRow, clock: str, where: str, use_un
             found.left_out.append(DriveMarker(match.get("marker_id"), family, row.id, place, False, reason, detail))
             continue
         assert time_s is not None
-        cov = np.array(fix["covariance"], float)
-        found.fixes.append(
-            PositionFix(
-                clock, time_s, fix["lon_deg"], fix["lat_deg"],
-                (float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])),
-                fix["heading_deg"], math.degrees(math.sqrt(cov[3, 3])),
-                heading_cross_m_rad=(float(cov[0, 3]), float(cov[1, 3])),
-                marker_id=match["marker_id"], family=reading["family"], decode_id=row.id, place=place,
-            )
-        )  # fmt: skip
+        found.fixes.append(_fix(clock, time_s, fix, match["marker_id"], reading["family"], row.id, place))
     if missing and not any(fix.decode_id == row.id for fix in found.fixes):
         raise _no_time(row, where, "captured_at of its frames", "send the time of each frame with the upload")
 
@@ -166,9 +157,8 @@ def _add_trace(found: Collected, row: DecodeRow, clock: str, where: str, use_unf
             cure="upload the trace again, or reprocess it",
         )
     zero_s = _trace_zero_s(row, motion, where)
-    at = zero_s + motion["start_s"] + motion["step_s"] * np.arange(
-        max(len(motion["speed_m_s"]), len(motion["heading_deg"]))
-    )  # fmt: skip
+    count = max(len(motion["speed_m_s"]), len(motion["heading_deg"]))
+    at = zero_s + motion["start_s"] + motion["step_s"] * np.arange(count)
     for name, series, sigma in (
         ("speed_m_s", found.speeds, SPEED_SIGMA_M_S),
         ("heading_deg", found.headings, HEADING_SIGMA_DEG),
@@ -184,15 +174,27 @@ def _add_trace(found: Collected, row: DecodeRow, clock: str, where: str, use_unf
         if reason is not None:
             found.left_out.append(DriveMarker(match.get("marker_id"), "magnet", row.id, place, False, reason, detail))
             continue
-        cov = np.array(fix["covariance"], float)
-        found.fixes.append(
-            PositionFix(
-                clock, zero_s + fix["t_s"], fix["lon_deg"], fix["lat_deg"],
-                (float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])),
-                fix["heading_deg"], math.degrees(math.sqrt(cov[2, 2])),
-                marker_id=match["marker_id"], family="magnet", decode_id=row.id, place=place,
-            )
-        )  # fmt: skip
+        found.fixes.append(_fix(clock, zero_s + fix["t_s"], fix, match["marker_id"], "magnet", row.id, place))
+
+
+def _fix(
+    clock: str, time_s: float, fix: StoredResult, marker_id: str, family: str, decode_id: str, place: int
+) -> PositionFix:
+    cov = np.array(fix["covariance"], float)  # the heading is its last row
+    return PositionFix(
+        clock,
+        time_s,
+        fix["lon_deg"],
+        fix["lat_deg"],
+        (float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])),
+        fix["heading_deg"],
+        math.degrees(math.sqrt(cov[-1, -1])),
+        heading_cross_m_rad=(float(cov[0, -1]), float(cov[1, -1])),
+        marker_id=marker_id,
+        family=family,
+        decode_id=decode_id,
+        place=place,
+    )
 
 
 def _add_packets(found: Collected, row: DecodeRow) -> None:
@@ -249,9 +251,7 @@ def _add_positions(found: Collected, row: DecodeRow, clock: Clock) -> None:
         found.clocks.setdefault(own.name, own)
 
 
-def _refused(
-    match: Mapping[str, Any], fix: Mapping[str, Any] | None, use_unfit: bool
-) -> tuple[LeftOutReason | None, str]:
+def _refused(match: StoredResult, fix: StoredResult | None, use_unfit: bool) -> tuple[LeftOutReason | None, str]:
     """Why a matched marker gives no fix."""
     if not match.get("registered"):
         return LeftOutReason.NOT_REGISTERED, match.get("note") or "no such marker is registered nearby"
@@ -271,14 +271,11 @@ def _refused(
 # --- times ------------------------------------------------------------------------------------------------------------
 
 
-def _seconds(stamp: Any) -> float | None:
-    if stamp is None:
-        return None
-    time: datetime = datetime.fromisoformat(stamp) if isinstance(stamp, str) else stamp
-    return time.timestamp()
+def _seconds(stamp: str | None) -> float | None:
+    return datetime.fromisoformat(stamp).timestamp() if stamp is not None else None
 
 
-def _trace_zero_s(row: DecodeRow, motion: Mapping[str, Any], where: str) -> float:
+def _trace_zero_s(row: DecodeRow, motion: StoredResult, where: str) -> float:
     """What is to be added to times of a trace: they begin at captured_at, unless they are seconds since 1970."""
     if motion["start_s"] > _EPOCH_S:
         return 0.0

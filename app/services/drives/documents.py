@@ -140,9 +140,14 @@ def drive_head(job: JobRow) -> DriveHead:
         links |= {"geojson": f"{path}/track.geojson", "csv": f"{path}/track.csv", "gpx": f"{path}/track.gpx"}
         links["plot"] = f"{path}/plot.svg"
     return document_of(
-        DriveHead, job, name=given.get("name"), vehicle=job.subject_id, decodes=given["decodes"],
-        options=given["options"], links=links,
-    )  # fmt: skip
+        DriveHead,
+        job,
+        name=given.get("name"),
+        vehicle=job.subject_id,
+        decodes=given["decodes"],
+        options=given["options"],
+        links=links,
+    )
 
 
 def track_report(track: Track, markers: Sequence[DriveMarker], warnings: tuple[str, ...]) -> DriveReport:
