@@ -200,7 +200,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
         """A reading as clients see it."""
         return _reading_document(reading)
 
-    def observation(self, reading: PlateReading) -> dict[str, Any]:
+    def observation(self, reading: PlateReading) -> dict[str, object]:
         """Confidence, grade and corrections."""
         return {
             "confidence": float(reading.confidence),
