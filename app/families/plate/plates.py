@@ -61,7 +61,6 @@ from app.markers.plate import (
     PlateScheme,
     code_cells,
     id_digits,
-    plate_capacity,
     position_digits,
     recommended_geometry,
     registry_number_bits,
@@ -629,7 +628,7 @@ def _kind_columns(code: PlateCode, geometry: PlateGeometry, matches_position: bo
 
 def _allocate(connection: sa.Connection, registration: Registration, n: int) -> PlateCode:
     """A free registry number at random, whose codeword cannot be taken for a position with two cells damaged."""
-    bits = round(plate_capacity(n, PlateScheme.ID).bits)
+    bits = registry_number_bits(n)
     for _ in range(_ALLOCATION_TRIES):
         code = PlateCode.from_registry_number(registration.random_bits(bits), n=n)
         if sum(d in _LETTERS for d in code.digits) < _MIN_LETTERS:
