@@ -43,14 +43,13 @@ def encode(
 ) -> None:
     """Write the artwork of one plate at true size, after the decoder has read it back."""
     from app.decoders.plate.reader import decode_plates
+    from app.families.plate.plates import GeometryIn
     from app.services.markers.plate_files import encode_plate_files, plate_for
 
     formats = _formats(form or ("svg", "pdf"))
     position = (lon_deg, lat_deg) if lon_deg is not None and lat_deg is not None else None
-    code, geometry = plate_for(
-        position, registry_number, scheme=scheme, check_digits=check_digits,
-        n=n, unit_mm=unit_mm, gap_mm=gap_mm, thickness_mm=thickness_mm,
-    )  # fmt: skip
+    size = GeometryIn(n=n, unit_mm=unit_mm, gap_mm=gap_mm, thickness_mm=thickness_mm)
+    code, geometry = plate_for(position, registry_number, size, scheme=scheme, check_digits=check_digits)
     files = encode_plate_files(
         code,
         geometry,

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Discriminator
 
 from app.families.cerpm import CERPM
-from app.families.family import Family
+from app.families.family import AnyFamily
 from app.families.fiducial import FIDUCIAL
 from app.families.magnet.magnets import MAGNET
 from app.families.plate.plates import PLATE
 
-FAMILIES: tuple[Family[Any, Any], ...] = (PLATE, MAGNET, CERPM, FIDUCIAL)
+FAMILIES: tuple[AnyFamily, ...] = (PLATE, MAGNET, CERPM, FIDUCIAL)
 FAMILY_NAMES = tuple(family.name for family in FAMILIES)
 _BY_NAME = {family.name: family for family in FAMILIES}
 
@@ -25,7 +25,7 @@ else:
     FamilyName = Literal[FAMILY_NAMES]  # for the schemas of requests
 
 
-def get_family(name: str) -> Family[Any, Any]:
+def get_family(name: str) -> AnyFamily:
     """The family with a name that the registry stores."""
     return _BY_NAME[name]
 

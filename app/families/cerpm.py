@@ -25,6 +25,7 @@ from app.families.documents import (
 )
 from app.families.family import Family, Registration, map_point
 from app.families.surveys import (
+    ColumnValues,
     Commitment,
     Flags,
     MarkerRules,
@@ -198,7 +199,7 @@ class CerpmSurvey(SurveyImport[CerpmSurveyIn]):
 
     members = CerpmSurveyIn
 
-    def defaults(self, declared: Mapping[str, Any]) -> CerpmSurveyIn:
+    def defaults(self, declared: Mapping[str, object]) -> CerpmSurveyIn:
         """Side and speed limit."""
         return CerpmSurveyIn.model_validate(declared)
 
@@ -261,8 +262,8 @@ class CerpmSurvey(SurveyImport[CerpmSurveyIn]):
     def columns(self, survey: GeoreferencedSurvey, codes: RowCodes, defaults: CerpmSurveyIn) -> Columns:
         """The spec, by the side of the row."""
         specs = _specs(defaults)
-        same: dict[str, Any] = {"scheme": codes.scheme}
-        own: dict[str, Sequence[Any]] = {}
+        same: dict[str, object] = {"scheme": codes.scheme}
+        own: dict[str, Sequence[object]] = {}
         if "side" in survey.table.texts:
             own["spec"] = [specs[side.lower() or defaults.side] for side in texts_of(survey, codes.rows, "side")]
         else:
@@ -327,7 +328,7 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
 
     def columns(
         self, connection: sa.Connection, registration: Registration, new: CerpmIn, prepared: PlacedPosition
-    ) -> dict[str, Any]:
+    ) -> ColumnValues:
         """Number, place and spec.
 
         Raises
@@ -359,8 +360,8 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
         return columns
 
     def revise(
-        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: ColumnValues
+    ) -> ColumnValues:
         """The spec after a change.
 
         Raises
@@ -372,7 +373,7 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
         message_of(row._replace(**{**values, "spec": spec}))
         return {"spec": spec}
 
-    def feature_members(self, properties: Mapping[str, Any]) -> dict[str, Any]:
+    def feature_members(self, properties: Mapping[str, object]) -> dict[str, object]:
         """The number."""
         if "code" not in properties:
             return {}
@@ -412,7 +413,7 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
             radio["jitter_share"].as_float().label("jitter_share"),
         )
 
-    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, object]:
         """Side, speed limit and the shortest interval between two transmissions."""
         spec = row.spec
         min_interval_s = spec["interval_s"] * (1 - spec["jitter_share"])
@@ -420,7 +421,7 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
 
     def snapshot_members(
         self, connection: sa.Connection, agency_id: str, codes: Sequence[str]
-    ) -> Mapping[str, Sequence[Any]]:
+    ) -> Mapping[str, Sequence[object]]:
         """First and last transmission that was received from each."""
         received = cerpms.list_span_ends(connection, agency_id, map(int, codes))
         ends = [received.get(int(code)) for code in codes]

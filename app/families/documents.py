@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal, NotRequired
+from typing import Annotated, Literal, NotRequired
 
 from pydantic import BaseModel, Field, JsonValue
 from typing_extensions import ReadOnly, TypedDict
 
 from app.errors import InvalidParameter
+from app.families.surveys import ColumnValues
 from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
 from app.geodesy.systems import VerticalDatum as VerticalDatum
@@ -43,7 +44,7 @@ class PositionDocument(TypedDict):
     localization_grade: Grade
     transform_accuracy_m: float | None
     transform_note: str | None
-    original: dict[str, Any]
+    original: dict[str, object]
 
 
 class WarningDocument(TypedDict):
@@ -254,7 +255,7 @@ def place_input(position: PositionIn, accuracy_m: float) -> PlacedPosition:
     )
 
 
-def position_columns(position: ProvenanceIn, placed: PlacedPosition) -> dict[str, Any]:
+def position_columns(position: ProvenanceIn, placed: PlacedPosition) -> ColumnValues:
     """Columns of a marker that keep its position, or the first one of its lane, and where it comes from."""
     return {
         "lon_deg": placed.lon_deg,

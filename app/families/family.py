@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from pydantic import JsonValue
 from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkOptions, Drawing, PlateReader
 from app.families.documents import FamilyChange, MarkerDocument, MarkerIn
-from app.families.surveys import Commitment, MarkerRules, PlannedRow, SurveyImport
+from app.families.surveys import ColumnValues, Commitment, MarkerRules, PlannedRow, SurveyImport
 from app.markers.reading import PlatePose
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedMarker
@@ -137,7 +137,7 @@ class FrameReader(ABC, Generic[ReadingT, SearchT]):
         """A reading as clients see it."""
 
     @abstractmethod
-    def observation(self, reading: ReadingT) -> dict[str, Any]:
+    def observation(self, reading: ReadingT) -> dict[str, object]:
         """Detail of the observation that a matched reading makes of its marker."""
 
 
@@ -206,7 +206,7 @@ class Family(ABC, Generic[New, Prepared]):
     @abstractmethod
     def columns(
         self, connection: sa.Connection, registration: Registration, new: New, prepared: Prepared
-    ) -> dict[str, Any]:
+    ) -> ColumnValues:
         """Columns of a new marker: its code, place, heading and spec.
 
         Raises
@@ -216,8 +216,8 @@ class Family(ABC, Generic[New, Prepared]):
         """
 
     def revise(
-        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: ColumnValues
+    ) -> ColumnValues:
         """Further columns of a marker that gets these values.
 
         Parameters
@@ -232,7 +232,7 @@ class Family(ABC, Generic[New, Prepared]):
     def index(self, connection: sa.Connection, agency_id: str, row: MarkerRow) -> None:
         """Store what searches need besides the marker's row, after the marker was stored or moved."""
 
-    def feature_members(self, properties: Mapping[str, Any]) -> dict[str, Any]:
+    def feature_members(self, properties: Mapping[str, object]) -> dict[str, object]:
         """Members of the request that registers the marker of a point feature, besides those of all families.
 
         Parameters
@@ -315,19 +315,20 @@ class Family(ABC, Generic[New, Prepared]):
         return ()
 
     @abstractmethod
-    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, object]:
         """What a marker has in common with others of its kind; plain values."""
 
     def snapshot_members(
         self, connection: sa.Connection, agency_id: str, codes: Sequence[str]
-    ) -> Mapping[str, Sequence[Any]]:
+    ) -> Mapping[str, Sequence[object]]:
         """Further columns of markers with these codes, by the names of `write_snapshot`; None for a missing value."""
         return {}
 
 
+AnyFamily: TypeAlias = Family[Any, Any]
+
+
 def map_point(row: MarkerRow, **members: Any) -> MapMarker:
     """A marker as one thing of an HD map, with members that only its family knows."""
-    return MapMarker(
-        row.id, row.family, row.digits, row.lon_deg, row.lat_deg, row.height_m, row.heading_deg,
-        vertical_datum=row.vertical_datum, **members,
-    )  # fmt: skip
+    place = (row.lon_deg, row.lat_deg, row.height_m, row.heading_deg)
+    return MapMarker(row.id, row.family, row.digits, *place, vertical_datum=row.vertical_datum, **members)

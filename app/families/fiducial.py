@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import sqlalchemy as sa
@@ -44,6 +44,7 @@ from app.families.family import (
 )
 from app.families.surveys import (
     RETIRED,
+    ColumnValues,
     MarkerRules,
     RowCodes,
     Rows,
@@ -240,7 +241,7 @@ class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
             "pose": reading.pose,
         }
 
-    def observation(self, reading: FiducialReading) -> dict[str, Any]:
+    def observation(self, reading: FiducialReading) -> dict[str, object]:
         """Confidence and errors."""
         return {"confidence": float(reading.confidence), "bit_errors": int(reading.bit_errors)}
 
@@ -266,7 +267,7 @@ class FiducialSurvey(SurveyImport[KnownFiducial | None]):
 
     members = FiducialSurveyIn
 
-    def defaults(self, declared: Mapping[str, Any]) -> KnownFiducial | None:
+    def defaults(self, declared: Mapping[str, object]) -> KnownFiducial | None:
         """Any sign of the declared dictionary and dimensions."""
         if declared.get("sign") is None:
             return None
@@ -362,7 +363,7 @@ class Fiducials(Family[FiducialIn, PlacedPosition]):
 
     def columns(
         self, connection: sa.Connection, registration: Registration, new: FiducialIn, prepared: PlacedPosition
-    ) -> dict[str, Any]:
+    ) -> ColumnValues:
         """Code, dimensions and place.
 
         Raises
@@ -381,8 +382,8 @@ class Fiducials(Family[FiducialIn, PlacedPosition]):
         }
 
     def revise(
-        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: ColumnValues
+    ) -> ColumnValues:
         """Nothing changes but the place, where the code must be free.
 
         Raises
@@ -395,7 +396,7 @@ class Fiducials(Family[FiducialIn, PlacedPosition]):
             _check_free(connection, registration, row.digits, merged.lon_deg, merged.lat_deg, row.id)
         return {}
 
-    def feature_members(self, properties: Mapping[str, Any]) -> dict[str, Any]:
+    def feature_members(self, properties: Mapping[str, object]) -> dict[str, object]:
         """Refuse a point: its properties do not say how large the sign is."""
         raise InvalidParameter(
             "a sign needs the size of its border, which a point does not have",
@@ -438,7 +439,7 @@ class Fiducials(Family[FiducialIn, PlacedPosition]):
         prove_fiducial(drawing, code, fiducial_geometry(row))
         return ArtworkProof(code.text, 1.0)
 
-    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, object]:
         """Dictionary, dimensions and mounting; `app.decoders.fiducial` reads signs on board."""
         return {"scheme": row.scheme, **row.spec}
 

@@ -42,7 +42,11 @@ class MarkerRules:
     idempotency_ttl: timedelta = timedelta(hours=24)
 
 
-def is_placed_again(row: MarkerRow, values: dict[str, Any]) -> bool:
+ColumnValues = dict[str, Any]
+"""Values by column of `markers`: those of a new marker, or those that change."""
+
+
+def is_placed_again(row: MarkerRow, values: ColumnValues) -> bool:
     """Whether a change gives a position, or puts a retired marker back into use."""
     return "lon_deg" in values or (row.status == RETIRED and values.get("status", RETIRED) != RETIRED)
 
@@ -52,13 +56,14 @@ def is_placed_again(row: MarkerRow, values: dict[str, Any]) -> bool:
 
 PLAN_METHOD = "placed by a plan"
 """Survey method of markers that nobody has surveyed yet."""
+_PLACE_IN_PLAN = ("number", "lane", "chainage_m", "offset_m")
 
 
 class PlannedRow(NamedTuple):
     """A row of `markers`: `covered` planned markers, the first of which has the number."""
 
     number: int
-    columns: dict[str, Any]
+    columns: ColumnValues
     covered: int = 1
 
 
@@ -73,19 +78,16 @@ class Commitment:
     codebook_id: str | None = None  # of the tags
     radio: RadioSettings = field(default_factory=RadioSettings)  # of the CERPMs
 
-    def original(self, marker: PlannedMarker) -> dict[str, Any]:
+    def original(self, marker: PlannedMarker) -> dict[str, object]:
         """Where a planned marker's position comes from."""
         return {
             "lon_deg": marker.lon_deg,
             "lat_deg": marker.lat_deg,
             **({"height_m": marker.height_m} if marker.height_m is not None else {}),
-            "plan": {
-                "id": self.plan_id, "number": marker.number, "lane": marker.lane, "chainage_m": marker.chainage_m,
-                "offset_m": marker.offset_m,
-            },
-        }  # fmt: skip
+            "plan": {"id": self.plan_id, **{name: getattr(marker, name) for name in _PLACE_IN_PLAN}},
+        }
 
-    def position(self, marker: PlannedMarker) -> dict[str, Any]:
+    def position(self, marker: PlannedMarker) -> ColumnValues:
         """Columns of a planned marker's position, and its place on the road."""
         road = self.alignment
         return {
@@ -163,7 +165,7 @@ class SurveyImport(ABC, Generic[DefaultsT]):
     members: ClassVar[type[BaseModel]]  # members of a survey's declaration that only this family has
 
     @abstractmethod
-    def defaults(self, declared: Mapping[str, Any]) -> DefaultsT:
+    def defaults(self, declared: Mapping[str, object]) -> DefaultsT:
         """What a survey's markers have in common, of the declared members.
 
         Raises

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal
 from enum import StrEnum
 from functools import lru_cache
-from typing import Any, Final
+from itertools import product
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +34,6 @@ from app.geodesy import check_lon_lat
 # Source: I.S. Reed and G. Solomon, "Polynomial codes over certain finite fields", J. SIAM 8 (1960), with the field x^4
 # + x + 1 and the roots alpha^0, alpha^1, ... A word holds at most 15 symbols, so that larger plates interleave two.
 
-
-Array = npt.NDArray[Any]
 
 FIELD = 0x13
 """[1] x^4 + x + 1, the polynomial of the field. Source: the id scheme's first plates."""
@@ -76,7 +75,7 @@ class ReedSolomonWord:
         return all(_codec(self.checks).check(word))
 
     @property
-    def generator(self) -> Array:
+    def generator(self) -> npt.NDArray[np.uint8]:
         """Generator matrix of the word without its mask, shape (data, cells)."""
         return _generator(len(self.cells), self.data)
 
@@ -100,23 +99,20 @@ def _codec(checks: int) -> reedsolo.RSCodec:
 
 
 @lru_cache
-def _generator(length: int, data: int) -> Array:
+def _generator(length: int, data: int) -> npt.NDArray[np.uint8]:
     rows = [list(_codec(length - data).encode([int(k == i) for k in range(data)])) for i in range(data)]
     return np.array(rows, dtype=np.uint8)
 
 
 @lru_cache
-def gf16_products() -> Array:
+def gf16_products() -> npt.NDArray[np.uint8]:
     """Products in the field, shape (16, 16)."""
+    powers = [1]
+    for _ in range(14):
+        powers.append(powers[-1] << 1 ^ (FIELD if powers[-1] & 8 else 0))
     table = np.zeros((16, 16), dtype=np.uint8)
-    power = 1
-    powers = []
-    for _ in range(15):
-        powers.append(power)
-        power = power << 1 ^ (FIELD if power & 8 else 0)
-    for i, a in enumerate(powers):
-        for k, b in enumerate(powers):
-            table[a, b] = powers[(i + k) % 15]
+    for (i, a), (k, b) in product(enumerate(powers), repeat=2):
+        table[a, b] = powers[(i + k) % 15]
     return table
 
 
@@ -154,13 +150,7 @@ class PlateScheme(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlateGeometry:
-    """Dimensions of a plate.
-
-    Raises
-    ------
-    InvalidParameter
-        A dimension, or the side that follows from them (150 to 500 mm), is outside the paper's limits.
-    """
+    """Dimensions of a plate."""
 
     n: int = 8  # units along a side: 8, 10 or 12
     unit_mm: float = 35.0  # [mm] side of a unit, 20 to 50
@@ -168,6 +158,7 @@ class PlateGeometry:
     thickness_mm: float = 20.0  # [mm] Thickness of the base plate, 5 to 50
 
     def __post_init__(self) -> None:
+        """Raises InvalidParameter if a dimension or the side (150 to 500 mm) is outside the paper's limits."""
         if self.n not in SIZES:
             raise InvalidParameter(
                 f"a plate has 8, 10 or 12 units along a side, not {self.n}",
@@ -208,9 +199,6 @@ def _check_range(field: str, value: float, limits: tuple[float, float], rule: st
         )
 
 
-# --- layout -----------------------------------------------------------------------------------------------------
-
-
 @lru_cache
 def code_cells(n: int) -> tuple[tuple[int, int], ...]:
     """(row, column) of the cells that hold symbols, in reading order: all but the four corners."""
@@ -234,9 +222,6 @@ def units_from_symbols(symbols: Sequence[int], n: int) -> npt.NDArray[np.uint8]:
     bits = (np.asarray(symbols, dtype=np.uint8)[:, None] >> np.array([3, 2, 1, 0], dtype=np.uint8)) & 1
     grid[index] = bits
     return grid.reshape(n, n)
-
-
-# --- code -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,13 +323,7 @@ def plate_capacity(n: int, scheme: PlateScheme, check_digits: int = 1) -> PlateC
 
 @dataclass(frozen=True, slots=True)
 class PlateCode:
-    """The symbols of one plate, checked against their scheme.
-
-    Raises
-    ------
-    CodeMismatch
-        Wrong length, alphabet or check.
-    """
+    """The symbols of one plate, checked against their scheme."""
 
     # one hexadecimal digit a cell in reading order; decimal for the schemes ``position`` and ``position-check``
     digits: str
@@ -353,6 +332,7 @@ class PlateCode:
     check_digits: int = 1  # for ``position-check``: 1 or 2 digits of the sum of the others
 
     def __post_init__(self) -> None:
+        """Raises CodeMismatch if the length, the alphabet or a check is wrong."""
         _layout(self.n, self.scheme, 1)
         if self.check_digits not in (1, 2):
             raise InvalidParameter("there are one or two check digits", field="check_digits", limit="1 or 2")
@@ -423,8 +403,6 @@ class PlateCode:
         ----------
         lon_deg, lat_deg : float
             Position of the plate's centre. [deg]
-        n : int
-            Units along a side.
         scheme : PlateScheme, optional
             Without, ``position``, or ``position-check`` with check digits.
         check_digits : int
@@ -586,13 +564,16 @@ def decimal_codes(symbols: Sequence[int], n: int = 8) -> tuple[PlateCode, ...]:
 
 
 Digits = npt.NDArray[np.bytes_]
+_Floats = npt.NDArray[np.float64]
+_Numbers = npt.NDArray[np.uint64]
+_Symbols = npt.NDArray[np.uint8]
 _NEAR_TIE = 0.02
 _ASCII = np.frombuffer(b"0123456789ABCDEF", dtype=np.uint8)
 
 
 def position_digits(
-    lon_deg: npt.NDArray[np.float64],
-    lat_deg: npt.NDArray[np.float64],
+    lon_deg: _Floats,
+    lat_deg: _Floats,
     *,
     n: int = 8,
     scheme: PlateScheme = PlateScheme.POSITION,
@@ -622,34 +603,30 @@ def position_digits(
     return digits
 
 
-def _decimals_of_many(
-    degrees: npt.NDArray[np.float64], places: int
-) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
+def _decimals_of_many(degrees: _Floats, places: int) -> tuple[_Numbers, npt.NDArray[np.bool_]]:
     """Decimals of |degrees| as numbers, and which of them need exact arithmetic."""
     scaled = np.abs(degrees) * 10.0**places
     decimals = np.rint(scaled).astype(np.uint64) % np.uint64(10**places)
     return decimals, np.abs(scaled - np.floor(scaled) - 0.5) < _NEAR_TIE
 
 
-def _decimal_symbols(
-    lon: npt.NDArray[np.uint64], lat: npt.NDArray[np.uint64], places: tuple[int, int], check_digits: int, cells: int
-) -> npt.NDArray[np.uint8]:
+def _decimal_symbols(lon: _Numbers, lat: _Numbers, places: tuple[int, int], check_digits: int, cells: int) -> _Symbols:
     symbols = np.zeros((len(lon), cells), dtype=np.uint8)
     start = 0
     for decimals, count in zip((lon, lat), places, strict=True):
         symbols[:, start : start + count] = _decimal_digits(decimals, count)
         start += count
-    total: npt.NDArray[np.uint64] = symbols.sum(axis=1, dtype=np.uint64)
+    total: _Numbers = symbols.sum(axis=1, dtype=np.uint64)
     symbols[:, start : start + check_digits] = _decimal_digits(total, check_digits)
     return symbols
 
 
-def _decimal_digits(numbers: npt.NDArray[np.uint64], count: int) -> npt.NDArray[np.uint8]:
+def _decimal_digits(numbers: _Numbers, count: int) -> _Symbols:
     powers = 10 ** np.arange(count, dtype=np.uint64)[::-1]
     return (numbers[:, None] // powers % np.uint64(10)).astype(np.uint8)
 
 
-def id_digits(numbers: npt.NDArray[np.uint64], *, n: int = 8) -> Digits:
+def id_digits(numbers: _Numbers, *, n: int = 8) -> Digits:
     """Digits of id plates, each as `PlateCode.from_registry_number` gives them, shape (N,); every number fits."""
     return _joined(_encoded(numbers, n, PlateScheme.ID))
 
@@ -659,7 +636,7 @@ def registry_number_bits(n: int) -> int:
     return round(plate_capacity(n, PlateScheme.ID).bits)
 
 
-def _encoded(numbers: npt.NDArray[np.uint64], n: int, scheme: PlateScheme) -> npt.NDArray[np.uint8]:
+def _encoded(numbers: _Numbers, n: int, scheme: PlateScheme) -> _Symbols:
     """Symbols of numbers in a scheme with Reed-Solomon words, shape (N, cells)."""
     zero, table = _linear(n, scheme)
     symbols = np.repeat(zero[None], len(numbers), axis=0)
@@ -670,7 +647,7 @@ def _encoded(numbers: npt.NDArray[np.uint64], n: int, scheme: PlateScheme) -> np
 
 
 @lru_cache
-def _linear(n: int, scheme: PlateScheme) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+def _linear(n: int, scheme: PlateScheme) -> tuple[_Symbols, _Symbols]:
     """Codeword of zero, and what each value of each hexadecimal digit changes in it: the code is linear but for it."""
     count = plate_capacity(n, scheme).data_symbols
     zero = np.array(encode_number(0, n, scheme), dtype=np.uint8)
@@ -678,7 +655,7 @@ def _linear(n: int, scheme: PlateScheme) -> tuple[npt.NDArray[np.uint8], npt.NDA
     return zero, np.array(words, dtype=np.uint8) ^ zero
 
 
-def _joined(symbols: npt.NDArray[np.uint8]) -> Digits:
+def _joined(symbols: _Symbols) -> Digits:
     return np.ascontiguousarray(_ASCII[symbols]).view(f"S{symbols.shape[1]}").ravel()
 
 
@@ -711,8 +688,6 @@ def recommended_geometry(
         Units along a side; without, 10 for ``position-robust`` and 8 for the others.
     unit_mm : float, optional
         Side of a unit; without, 27 for ``position-robust`` on 10 x 10 and 35 for the others. [mm]
-    gap_mm, thickness_mm : float
-        [mm]
 
     Raises
     ------

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Query, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field, JsonValue
 
-from app.api.http.dependencies import Caller, Idempotency, MarkerId, Number, use_case
+from app.api.http.dependencies import Caller, Idempotency, MarkerId, use_case
 from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -29,43 +29,25 @@ from app.api.markers.searches import SelectionIn
 from app.encoders.cerpm import hex_dump
 from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkFormat, ArtworkOptions
-from app.families.documents import Flag, StrictModel
+from app.families.documents import Flag
 from app.markers.cerpm import MAX_SEQUENCE
-from app.services.markers.artwork import ArtworkJobs, Artworks, Bundle, bundle_options
+from app.services.markers.artwork import ArtworkJobs, Artworks, ArtworkTerms, Bundle, Resolution
 from app.services.markers.programs import CerpmPrograms, Layouts, PayloadDocument, payload_document
 from app.services.progress import OtherJob
 
 router = Router("/v1", "artwork")
 
 _CHUNK = 1 << 18
-Resolution = Annotated[float, Field(ge=20, le=300, allow_inf_nan=False)]
 _EXAMPLES: list[JsonValue] = [
     {"bbox": [114.1, 22.2, 114.3, 22.4], "status": "planned", "formats": ["pdf", "dxf"], "heaters": True},
     {"marker_ids": ["0197a3c2-7d1e-7b60-a7a1-52b9a4a7d911"], "sheet": {"width_mm": 1500, "height_mm": 3000}},
 ]
 
 
-class SheetIn(StrictModel):
-    """A sheet that plates are nested on."""
-
-    width_mm: Number = Field(description="Width, up to 5000. [mm]")
-    height_mm: Number = Field(description="Height, up to 5000. [mm]")
-
-
-class ArtworkIn(SelectionIn):
+class ArtworkIn(SelectionIn, ArtworkTerms):
     """Plates to make, by id or by filter, and how."""
 
     model_config = ConfigDict(json_schema_extra={"examples": _EXAMPLES})
-
-    formats: list[ArtworkFormat] = Field([ArtworkFormat.PDF, ArtworkFormat.SVG], min_length=1, max_length=4)
-    heaters: Flag = Field(False, description="Heating tracks under dark units.")
-    leds: Flag = Field(False, description="Light sources under light units.")
-    resolution_dpi: Resolution = Field(150.0, description="Of PNG files. [1/inch]")
-    sheet: SheetIn | None = Field(None, description="Also nest the plates on sheets of this size.")
-
-    def declared(self) -> dict[str, Any]:
-        """The options as they are stored in a job."""
-        return self.model_dump(include={"formats", "heaters", "leds", "resolution_dpi", "sheet"}, mode="json")
 
 
 _HEADERS = {
@@ -142,8 +124,8 @@ def post_artwork(
     Without a public address of the server the plates have no QR codes; `notes` of the manifest states the reason.
     """
     if wants_job(prefer) or jobs.is_job(caller, wanted.selection()):
-        return queued_job(*jobs.submit(caller, wanted.selection(), wanted.declared(), idempotency))
-    bundle = artworks.bundle(caller, wanted.selection(), bundle_options(wanted.declared()))
+        return queued_job(*jobs.submit(caller, wanted.selection(), wanted, idempotency))
+    bundle = artworks.bundle(caller, wanted.selection(), wanted.options)
     headers = {
         "Content-Length": str(bundle.size),
         "Content-Disposition": 'attachment; filename="waymark-artwork.zip"',

@@ -167,9 +167,11 @@ class PrintGradeIn(StrictModel):
         """
         if self.marker_id is not None and (self.code is not None or self.geometry is not None):
             raise InvalidParameter(
-                "the declaration names a marker and gives a code or a geometry too", field="marker_id",
-                limit="a marker, or a code and a geometry", cure="leave code and geometry out: the marker has them",
-            )  # fmt: skip
+                "the declaration names a marker and gives a code or a geometry too",
+                field="marker_id",
+                limit="a marker, or a code and a geometry",
+                cure="leave code and geometry out: the marker has them",
+            )
         scheme = self.code.scheme if self.code is not None else RECOMMENDED_SCHEME
         geometry = None if self.geometry is None else self.geometry.of_scheme(scheme)
         if self.code is not None and geometry is None:

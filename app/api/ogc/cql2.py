@@ -72,7 +72,7 @@ class Reader:
             )
         return condition
 
-    def compared(self, name: str, symbol: str, value: Any) -> Compared:
+    def compared(self, name: str, symbol: str, value: object) -> Compared:
         """A comparison, its value of the property's kind."""
         kind = self.kind_of(name)
         if symbol == "like" and (kind != "string" or not isinstance(value, str)):
@@ -89,7 +89,7 @@ class Reader:
         """The number that a text says."""
         return self._number(text)
 
-    def _of_kind(self, name: str, kind: str, value: Any) -> Value:
+    def _of_kind(self, name: str, kind: str, value: object) -> Value:
         if kind == "date-time" and isinstance(value, str):
             return self._moment(value)
         if kind in ("number", "integer") and isinstance(value, int | float) and not isinstance(value, bool):
@@ -271,7 +271,7 @@ class _Json:
             raise
         return self._condition(document, 0)
 
-    def _condition(self, node: Any, depth: int) -> Condition:
+    def _condition(self, node: object, depth: int) -> Condition:
         if depth > MAX_DEPTH:
             refuse_filter("the filter is nested too deeply", f"{MAX_DEPTH} levels")
         if isinstance(node, bool):
@@ -287,7 +287,7 @@ class _Json:
             return Not(self._condition(arguments[0], depth + 1))
         return self._predicate(symbol, arguments)
 
-    def _predicate(self, symbol: Any, arguments: list[Any]) -> Condition:
+    def _predicate(self, symbol: Any, arguments: list[object]) -> Condition:
         match symbol, arguments:
             case "isNull", [{"property": str(name)}]:
                 self._reader.kind_of(name)
@@ -312,7 +312,7 @@ def _between(reader: Reader, name: str, low: Any, high: Any) -> Condition:
     return Joined(True, (reader.compared(name, ">=", low), reader.compared(name, "<=", high)))
 
 
-def _literal(value: Any) -> Any:
+def _literal(value: object) -> Any:
     match value:
         case {"timestamp": str(text)} | {"date": str(text)}:
             return text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends
 from starlette.responses import Response
@@ -68,9 +68,9 @@ _ROLES = {"family": "type", "updated_at": "primary-instant"}
 _UNIT = re.compile(r" \[([^\]]+)\]$")
 
 
-def property_schema(collection: Collection, url: str) -> dict[str, Any]:
+def property_schema(collection: Collection, url: str) -> dict[str, object]:
     """The properties of a collection's features, independent of their format; the geometry is one of them."""
-    properties: dict[str, Any] = {
+    properties: dict[str, dict[str, object]] = {
         "id": {"title": "Id of the feature", "type": "string", "readOnly": True, "x-ogc-role": "id"},
         "geometry": {
             "title": "Position" if collection.geometry == "Point" else "Course",
@@ -94,7 +94,7 @@ def property_schema(collection: Collection, url: str) -> dict[str, Any]:
     }
 
 
-def geojson_schema(collection: Collection, url: str) -> dict[str, Any]:
+def geojson_schema(collection: Collection, url: str) -> dict[str, object]:
     """A feature as GeoJSON: GDAL takes the types of fields from it; without it, it guesses from the first page."""
     return {
         "$schema": _DRAFT,
@@ -111,7 +111,7 @@ def geojson_schema(collection: Collection, url: str) -> dict[str, Any]:
     }
 
 
-def queryables(collection: Collection, url: str) -> dict[str, Any]:
+def queryables(collection: Collection, url: str) -> dict[str, object]:
     """What filters can ask of a collection's features."""
     return {
         "$schema": _DRAFT,
@@ -132,8 +132,8 @@ def _plain(collection: Collection) -> dict[str, dict[str, str]]:
     return {field.name: schema_type(field.kind) | {"title": field.text} for field in collection.fields}
 
 
-def _returnable(field: Field, is_receivable: bool) -> dict[str, Any]:
-    described: dict[str, Any] = {**schema_type(field.kind), "title": field.text}
+def _returnable(field: Field, is_receivable: bool) -> dict[str, object]:
+    described: dict[str, object] = {**schema_type(field.kind), "title": field.text}
     unit = _UNIT.search(field.text)
     if unit is not None and unit[1] in _UNITS:
         described |= {"x-ogc-unit": _UNITS[unit[1]]}
@@ -155,9 +155,9 @@ _PROBLEM = {
 }
 
 
-def api_document(base: str) -> dict[str, Any]:
+def api_document(base: str) -> dict[str, object]:
     """The OpenAPI document of /ogc for a server that is reached at `base`."""
-    paths: dict[str, Any] = {
+    paths: dict[str, object] = {
         "/": _read("Landing page"),
         "/conformance": _read("Conformance classes"),
         "/api": _read("This document"),
@@ -184,7 +184,7 @@ def api_document(base: str) -> dict[str, Any]:
     }
 
 
-def _paths(collection: Collection) -> dict[str, Any]:
+def _paths(collection: Collection) -> dict[str, object]:
     url, name = f"/collections/{collection.id}", collection.title
     items = _read(f"{name}: a page", GEOJSON, list_parameters(collection))
     item = _read(f"{name}: one", GEOJSON, OF_ITEM)
@@ -199,7 +199,7 @@ def _paths(collection: Collection) -> dict[str, Any]:
     }
 
 
-def _read(summary: str, kind: str = JSON, parameters: tuple[str, ...] = ONLY_FORMAT) -> dict[str, Any]:
+def _read(summary: str, kind: str = JSON, parameters: tuple[str, ...] = ONLY_FORMAT) -> dict[str, object]:
     return {
         "get": {
             "summary": summary,
@@ -212,9 +212,9 @@ def _read(summary: str, kind: str = JSON, parameters: tuple[str, ...] = ONLY_FOR
     }
 
 
-def _parameters() -> dict[str, Any]:
+def _parameters() -> dict[str, object]:
     feature = {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}}
-    return {name: parameters_described(name) for name in PARAMETERS} | {"featureId": feature}
+    return {**{name: parameters_described(name) for name in PARAMETERS}, "featureId": feature}
 
 
 # === The documents that lead to features.

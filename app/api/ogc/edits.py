@@ -35,7 +35,7 @@ from app.api.ogc.responses import (
 )
 from app.errors import InvalidParameter, StaleVersion, UnsupportedUpload
 from app.families import FAMILIES, FAMILY_NAMES, get_family
-from app.families.family import Family
+from app.families.family import AnyFamily
 from app.formats.json_text import parse_json
 from app.geodesy.systems import is_ellipsoidal
 from app.services.access.access import Caller as CallerValue
@@ -234,7 +234,7 @@ def _warned(answer: Response) -> dict[str, str]:
     return {"Waymark-Warnings": " ".join(warning["code"] for warning in found)} if found else {}
 
 
-def _family(name: Any) -> Family[Any, Any]:
+def _family(name: object) -> AnyFamily:
     if name not in FAMILY_NAMES:
         raise InvalidParameter(
             f"there is no family {str(name)[:40]!r}", field="properties.family", limit=", ".join(FAMILY_NAMES)

@@ -229,7 +229,7 @@ def _place(geometry: Mapping[str, Any], *, whole: bool = False) -> str:
     return "; ".join(points) if whole else f"{points[0]} to {points[-1]}"
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     if value is None:
         return ""
     return value if isinstance(value, str) else orjson.dumps(value).decode()

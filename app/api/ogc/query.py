@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 from urllib.parse import parse_qsl
 
 from starlette.requests import Request
@@ -35,7 +35,7 @@ _NUMBERS = {"type": "array", "minItems": 4, "maxItems": 6, "items": {"type": "nu
 class Parameter(NamedTuple):
     """A query parameter: its JSON schema, and its description."""
 
-    schema: dict[str, Any]
+    schema: Mapping[str, object]
     text: str
 
 
@@ -87,7 +87,7 @@ def list_parameters(collection: Collection) -> tuple[str, ...]:
     return (*OF_ITEMS, *collection.filters)
 
 
-def described(name: str, formats: tuple[str, ...] = ("json", "html")) -> dict[str, Any]:
+def described(name: str, formats: tuple[str, ...] = ("json", "html")) -> dict[str, object]:
     """A query parameter as OpenAPI describes it, of a route that offers some formats."""
     parameter = PARAMETERS[name]
     schema = {"type": "string", "enum": list(formats)} if name == "f" else parameter.schema

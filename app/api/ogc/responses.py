@@ -338,7 +338,7 @@ class ReadDescription(TypedDict):
     """Arguments of a route that reads."""
 
     responses: Described
-    openapi_extra: dict[str, Any]
+    openapi_extra: dict[str, object]
 
 
 def describe_read(

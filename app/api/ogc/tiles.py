@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any, NotRequired, TypedDict
+from collections.abc import Sequence
+from typing import Annotated, NotRequired, TypedDict
 
 from fastapi import Depends, Path, Request
 from starlette.responses import Response
@@ -119,15 +120,15 @@ def tilejson(collection: Collection, tiles_url: str, extent: Extent | None) -> T
     return document
 
 
-def map_style(collection: Collection, tiles_url: str, sprite_url: str, extent: Extent | None) -> dict[str, Any]:
+def map_style(collection: Collection, tiles_url: str, sprite_url: str, extent: Extent | None) -> dict[str, object]:
     """A style that draws a tileset: dots that every client can draw, and over them a symbol for each feature.
 
     Each family with each status is a layer of its own: QGIS 3.22 draws an icon that an expression chooses with the
     expression's last value only. There are no texts, and so no glyphs.
     """
     looks = _LOOKS.get(collection.id, _MARKER_LOOKS)
-    source: dict[str, Any] = {"type": "vector", "tiles": [tiles_url], "minzoom": 0, "maxzoom": MAX_ZOOM}
-    document: dict[str, Any] = {
+    source: dict[str, object] = {"type": "vector", "tiles": [tiles_url], "minzoom": 0, "maxzoom": MAX_ZOOM}
+    document: dict[str, object] = {
         "version": 8,
         "name": collection.title,
         "sprite": sprite_url,
@@ -146,12 +147,12 @@ def _bounds(extent: Extent) -> list[float]:
     return [west, extent.south_deg, east, extent.north_deg]
 
 
-def _by_status(values: dict[str, str], other: str) -> list[Any]:
+def _by_status(values: dict[str, str], other: str) -> list[object]:
     pairs = [part for status, value in values.items() for part in (status, value)]
     return ["match", ["get", "status"], *pairs, other]
 
 
-def _dots(collection: Collection, looks: dict[str, str]) -> dict[str, Any]:
+def _dots(collection: Collection, looks: dict[str, str]) -> dict[str, object]:
     colours = {status: "#{:02x}{:02x}{:02x}".format(*_visible(look)) for status, look in looks.items()}
     return {
         "id": "Dots",
@@ -173,8 +174,8 @@ def _visible(look: str) -> tuple[int, int, int]:
     return outline if fill == (255, 255, 255) else fill
 
 
-def _symbols(collection: Collection, looks: dict[str, str]) -> list[dict[str, Any]]:
-    kinds: list[tuple[str, str, list[Any]]] = [
+def _symbols(collection: Collection, looks: dict[str, str]) -> list[dict[str, object]]:
+    kinds: list[tuple[str, str, Sequence[object]]] = [
         (family.name, family.title, ["==", ["get", "family"], family.name]) for family in FAMILIES
     ]
     if collection.id == MAINTENANCE_ITEMS.id:  # what is not registered has no family
@@ -313,9 +314,13 @@ def get_tileset(collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, 
 
 @router.get("/collections/{collection}/tiles/{matrix_set}/tilejson", READERS, **describe_read(JsonObject, html=False))
 def get_tilejson(
-    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl, caller: Caller,
+    collection: Tiled,
+    _matrix_set: MatrixSet,
+    _offers: OffersJson,
+    base: BaseUrl,
+    caller: Caller,
     features: FeaturesService,
-) -> Response:  # fmt: skip
+) -> Response:
     """Get a tile set of a collection as TileJSON 3.0."""
     return answer(tilejson(collection, _template(base, collection), features.extent(caller, collection)))
 
@@ -324,9 +329,13 @@ def get_tilejson(
     "/collections/{collection}/tiles/{matrix_set}/style", READERS, **describe_read(JsonObject, MAP_STYLE, html=False)
 )
 def get_map_style(
-    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersStyle, base: BaseUrl, caller: Caller,
+    collection: Tiled,
+    _matrix_set: MatrixSet,
+    _offers: OffersStyle,
+    base: BaseUrl,
+    caller: Caller,
     features: FeaturesService,
-) -> Response:  # fmt: skip
+) -> Response:
     """Get a MapLibre style of a tile set.
 
     It has symbols by family and status.

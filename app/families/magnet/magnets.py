@@ -35,7 +35,7 @@ from app.families.magnet.layouts import (
     sheet_of,
     worst_grade,
 )
-from app.families.surveys import PLAN_METHOD, Commitment, MarkerRules, PlannedRow, is_placed_again
+from app.families.surveys import PLAN_METHOD, ColumnValues, Commitment, MarkerRules, PlannedRow, is_placed_again
 from app.markers.magnet import MIN_GAP_M, InformationTag, LineStyle, LineTag, Orientation, Tag, parse_tag
 from app.markers.magnet_design import Meaning
 from app.planning.magnet_checks import HALF_BAR_M, Neighbour
@@ -132,23 +132,19 @@ def magnets_of_map(row: MarkerRow) -> list[MapMarker]:
     """The magnets of a marker; the height that was surveyed is that of the first one, and holds for a tag only."""
     layout = layout_of(row.id, row.spec)
     is_line = isinstance(layout.tag, LineTag)
-    return [
-        MapMarker(
-            f"{row.id}.{hole.number}", row.family, row.digits, hole.lon_deg, hole.lat_deg,
-            None if is_line else row.height_m,
-            bearing_deg(layout.lane.direction_at(hole.chainage_m)) if is_line else layout.bearing_deg % 360.0,
-            "line" if is_line else "information", vertical_datum=row.vertical_datum,
-        )
-        for hole in layout.holes
-    ]  # fmt: skip
+    kind, height_m = ("line", None) if is_line else ("information", row.height_m)
+    found = []
+    for hole in layout.holes:
+        bearing = bearing_deg(layout.lane.direction_at(hole.chainage_m)) if is_line else layout.bearing_deg % 360.0
+        place, name = (hole.lon_deg, hole.lat_deg, height_m, bearing), f"{row.id}.{hole.number}"
+        found.append(MapMarker(name, row.family, row.digits, *place, kind, vertical_datum=row.vertical_datum))
+    return found
 
 
 # === Columns of a marker that is a tag or a line of magnets.
 
 
-def magnet_columns(
-    new: MagnetIn, tag: Tag, meaning: Meaning | None, rules: MarkerRules, now: datetime
-) -> dict[str, Any]:
+def magnet_columns(new: MagnetIn, tag: Tag, meaning: Meaning | None, rules: MarkerRules, now: datetime) -> ColumnValues:
     """Columns of a tag or a line of magnets that breaks no limit by itself.
 
     Raises
@@ -226,7 +222,7 @@ def _planned_lane(commitment: Commitment, points_deg: list[list[float]], height_
 # === The family of magnet markers.
 
 
-class Magnets(Family[MagnetIn, dict[str, Any]]):
+class Magnets(Family[MagnetIn, ColumnValues]):
     """The family of magnet markers."""
 
     name = "magnet"
@@ -240,7 +236,7 @@ class Magnets(Family[MagnetIn, dict[str, Any]]):
     document_type = MagnetDocument
     detail_type = MagnetDetailDocument
 
-    def prepare(self, registration: Registration, new: MagnetIn) -> dict[str, Any]:
+    def prepare(self, registration: Registration, new: MagnetIn) -> ColumnValues:
         """Columns of a layout that breaks no limit by itself.
 
         Raises
@@ -254,8 +250,8 @@ class Magnets(Family[MagnetIn, dict[str, Any]]):
         return magnet_columns(new, tag, meaning, registration.rules, registration.now)
 
     def columns(
-        self, connection: sa.Connection, registration: Registration, new: MagnetIn, prepared: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, connection: sa.Connection, registration: Registration, new: MagnetIn, prepared: ColumnValues
+    ) -> ColumnValues:
         """The columns, with the markers nearby.
 
         Raises
@@ -269,8 +265,8 @@ class Magnets(Family[MagnetIn, dict[str, Any]]):
         }
 
     def revise(
-        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: ColumnValues
+    ) -> ColumnValues:
         """Columns of the layout after the survey of a tag, or back in use.
 
         Raises
@@ -307,7 +303,7 @@ class Magnets(Family[MagnetIn, dict[str, Any]]):
         ]
         replace_magnets(connection, agency_id, row.id, holes)
 
-    def feature_members(self, properties: Mapping[str, Any]) -> dict[str, Any]:
+    def feature_members(self, properties: Mapping[str, object]) -> dict[str, object]:
         """Refuse a point: magnets are placed along a lane."""
         raise InvalidParameter(
             "magnets need a lane, which a point does not have",
@@ -350,7 +346,7 @@ class Magnets(Family[MagnetIn, dict[str, Any]]):
             spec["meaning"].label("meaning"),
         )
 
-    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, object]:
         """Scheme and meaning."""
         return {"scheme": row.scheme, "meaning": row.spec["meaning"]}
 

@@ -212,7 +212,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
             "pose": reading.pose,
         }
 
-    def observation(self, reading: PlateReading) -> dict[str, Any]:
+    def observation(self, reading: PlateReading) -> dict[str, object]:
         """Confidence, grade and corrections."""
         return {
             "confidence": float(reading.confidence),

@@ -9,7 +9,7 @@ import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import sqlalchemy as sa
@@ -40,6 +40,7 @@ from app.families.plate.frames import PlateFrames, plate_code, plate_geometry
 from app.families.surveys import (
     PLANNED,
     RETIRED,
+    ColumnValues,
     Commitment,
     Flags,
     MarkerRules,
@@ -60,7 +61,6 @@ from app.markers.plate import (
     PlateScheme,
     code_cells,
     id_digits,
-    plate_capacity,
     position_digits,
     recommended_geometry,
     registry_number_bits,
@@ -348,7 +348,7 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
 
     members = PlateSurveyIn
 
-    def defaults(self, declared: Mapping[str, Any]) -> PlateDefaults:
+    def defaults(self, declared: Mapping[str, object]) -> PlateDefaults:
         """Scheme, check digits and dimensions."""
         sent = PlateSurveyIn.model_validate(declared)
         if sent.check_digits is not None and sent.scheme is not PlateScheme.POSITION_CHECK:
@@ -526,7 +526,7 @@ class Plates(Family[PlateIn, PlacedPosition]):
 
     def columns(
         self, connection: sa.Connection, registration: Registration, new: PlateIn, prepared: PlacedPosition
-    ) -> dict[str, Any]:
+    ) -> ColumnValues:
         """Code, dimensions and place of a plate whose code is free.
 
         Raises
@@ -546,7 +546,7 @@ class Plates(Family[PlateIn, PlacedPosition]):
             **position_columns(new.position, prepared),
         }
 
-    def feature_members(self, properties: Mapping[str, Any]) -> dict[str, Any]:
+    def feature_members(self, properties: Mapping[str, object]) -> dict[str, object]:
         """Scheme and digits."""
         code = {"scheme": properties.get("scheme"), "digits": properties.get("code")}
         return {"code": {name: value for name, value in code.items() if value is not None}}
@@ -560,8 +560,8 @@ class Plates(Family[PlateIn, PlacedPosition]):
         return (map_point(row, kind=row.scheme, side_m=plate_geometry(row).side_mm / 1000),)
 
     def revise(
-        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]
-    ) -> dict[str, Any]:
+        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: ColumnValues
+    ) -> ColumnValues:
         """Columns of the code after a move: a planned plate's digits follow, a built one's stay as they are.
 
         Raises
@@ -607,7 +607,7 @@ class Plates(Family[PlateIn, PlacedPosition]):
             columns = commitment.position(marker) | _kind_columns(detail.code, detail.geometry, matches)
             yield PlannedRow(marker.number, columns)
 
-    def snapshot_kind(self, row: MarkerRow) -> dict[str, Any]:
+    def snapshot_kind(self, row: MarkerRow) -> dict[str, object]:
         """Scheme and dimensions."""
         return {name: getattr(row, name) for name in _KIND}
 
@@ -628,7 +628,7 @@ def _kind_columns(code: PlateCode, geometry: PlateGeometry, matches_position: bo
 
 def _allocate(connection: sa.Connection, registration: Registration, n: int) -> PlateCode:
     """A free registry number at random, whose codeword cannot be taken for a position with two cells damaged."""
-    bits = round(plate_capacity(n, PlateScheme.ID).bits)
+    bits = registry_number_bits(n)
     for _ in range(_ALLOCATION_TRIES):
         code = PlateCode.from_registry_number(registration.random_bits(bits), n=n)
         if sum(d in _LETTERS for d in code.digits) < _MIN_LETTERS:

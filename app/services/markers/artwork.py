@@ -6,15 +6,15 @@ import hashlib
 import tempfile
 import threading
 import zipfile
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import IO, Annotated, Any
 
 import orjson
+from pydantic import Field
 
 from app.encoders.packer import Packer
 from app.encoders.plate import ArtworkFormat, ArtworkOptions, BundleOptions, PlateReader, write_artwork, write_bundle
@@ -22,8 +22,9 @@ from app.encoders.plate.bundle import NO_QR_CODE, bundle_manifest, plate_names
 from app.encoders.plate.writers import DEFAULT_DPI
 from app.errors import NotFound, Unavailable
 from app.families import FAMILIES, get_family
-from app.families.family import ArtworkProof, Family
+from app.families.family import AnyFamily, ArtworkProof
 from app.families.plate.plates import PLATE, is_unfit, plate_order
+from app.inputs import Flag, Number, StrictModel
 from app.registry import jobs as registry_jobs
 from app.registry import markers as store
 from app.registry.column_types import new_id
@@ -40,6 +41,7 @@ from app.services.ports import Clock, DecoderProcesses, JobQueue
 from app.services.progress import JobDocument, JobFiles, job_document
 
 MAX_PLATES = 5_000
+Resolution = Annotated[float, Field(ge=20, le=300, allow_inf_nan=False)]
 _BUNDLES_AT_ONCE = 2
 
 
@@ -151,7 +153,7 @@ class Artworks:
             file, size, len(rows), sum(is_unfit(row) for row in rows), _lowest_confidence(manifest), self.qr_code
         )
 
-    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, object]]:
+    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, AnyFamily]:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         family = get_family(row.family)
@@ -181,6 +183,33 @@ def _lowest_confidence(manifest: dict[str, Any]) -> float:
 # === Artwork of many plates as a job: each is drawn and read back in a decoder process, and the ZIP is written to disk.
 
 
+class SheetSize(StrictModel):
+    """A sheet that plates are nested on."""
+
+    width_mm: Number = Field(description="Width, up to 5000. [mm]")
+    height_mm: Number = Field(description="Height, up to 5000. [mm]")
+
+
+class ArtworkTerms(StrictModel):
+    """How plates are made."""
+
+    formats: list[ArtworkFormat] = Field([ArtworkFormat.PDF, ArtworkFormat.SVG], min_length=1, max_length=4)
+    heaters: Flag = Field(False, description="Heating tracks under dark units.")
+    leds: Flag = Field(False, description="Light sources under light units.")
+    resolution_dpi: Resolution = Field(DEFAULT_DPI, description="Of PNG files. [1/inch]")
+    sheet: SheetSize | None = Field(None, description="Also nest the plates on sheets of this size.")
+
+    @property
+    def options(self) -> BundleOptions:
+        """The same for the writers."""
+        return BundleOptions(
+            formats=tuple(dict.fromkeys(self.formats)),
+            artwork=ArtworkOptions(heaters=self.heaters, leds=self.leds),
+            sheet_mm=(self.sheet.width_mm, self.sheet.height_mm) if self.sheet else None,
+            dpi=self.resolution_dpi,
+        )
+
+
 IMMEDIATE_PLATES = 10
 """More plates become a job. Source: half a second each, drawn and read back; a client waits for five."""
 
@@ -197,9 +226,17 @@ class ArtworkJobs:
     """
 
     def __init__(
-        self, database: Database, clock: Clock, processes: DecoderProcesses, queue: JobQueue, files: JobFiles,
-        *, public_url: str, in_flight: int = 2, idempotency_ttl: timedelta = timedelta(hours=24),
-    ) -> None:  # fmt: skip
+        self,
+        database: Database,
+        clock: Clock,
+        processes: DecoderProcesses,
+        queue: JobQueue,
+        files: JobFiles,
+        *,
+        public_url: str,
+        in_flight: int = 2,
+        idempotency_ttl: timedelta = timedelta(hours=24),
+    ) -> None:
         self._database, self._clock, self._processes, self._queue = database, clock, processes, queue
         self._files, self._public_url = files, public_url
         self._in_flight, self._ttl = in_flight, idempotency_ttl
@@ -209,7 +246,7 @@ class ArtworkJobs:
         return len(self._select(caller, selection)) > IMMEDIATE_PLATES
 
     def submit(
-        self, caller: Caller, selection: Selection, options: Mapping[str, object], key: IdempotencyKey | None = None
+        self, caller: Caller, selection: Selection, terms: ArtworkTerms, key: IdempotencyKey | None = None
     ) -> tuple[JobDocument, bool]:
         """Queue the artwork of the plates that are selected now; returns whether it was queued before.
 
@@ -223,7 +260,11 @@ class ArtworkJobs:
         now, agency_id = self._clock(), caller.agency_id
         if earlier := find_earlier(self._database, agency_id, key, now):
             return earlier, True
-        job_input = {"marker_ids": self._select(caller, selection), "options": dict(options), "label": caller.label}
+        job_input = {
+            "marker_ids": self._select(caller, selection),
+            "options": terms.model_dump(mode="json", include=set(ArtworkTerms.model_fields)),
+            "label": caller.label,
+        }
         job = new_job(JobKind.ARTWORK, new_id(now), agency_id, caller.key_id, now, job_input=job_input)
         with write_once(self._database, agency_id, key, now, self._ttl) as (connection, answer):
             if answer.replayed:
@@ -235,7 +276,7 @@ class ArtworkJobs:
 
     def run(self, job: RunningJob) -> None:
         """Write the ZIP; the handler of jobs of the kind `JobKind.ARTWORK`."""
-        options = bundle_options(job.row.input["options"])
+        options = ArtworkTerms(**job.row.input["options"]).options
         selection = Selection(tuple(job.row.input["marker_ids"]))
         with self._database.read() as connection:
             rows = select_markers(connection, job.row.agency_id, selection, PLATE.name, most=MAX_PLATES)
@@ -273,14 +314,3 @@ class ArtworkJobs:
         with self._database.read() as connection:
             rows = select_markers(connection, caller.agency_id, selection, PLATE.name, most=MAX_PLATES)
         return [row.id for row in rows]
-
-
-def bundle_options(given: Mapping[str, Any]) -> BundleOptions:
-    """Options from the members of a request, as they are stored in the job."""
-    sheet = given.get("sheet")
-    return BundleOptions(
-        formats=tuple(dict.fromkeys(ArtworkFormat(form) for form in given["formats"])),
-        artwork=ArtworkOptions(heaters=given["heaters"], leds=given["leds"]),
-        sheet_mm=(sheet["width_mm"], sheet["height_mm"]) if sheet else None,
-        dpi=given["resolution_dpi"],
-    )

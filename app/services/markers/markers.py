@@ -16,8 +16,8 @@ from typing_extensions import TypedDict
 from app.errors import InvalidParameter
 from app.families import FAMILIES, get_family, union_of_documents
 from app.families.documents import MarkerDocument, MarkerIn, PositionIn, WarningDocument, place_input, position_columns
-from app.families.family import Family, Registration
-from app.families.surveys import MarkerRules
+from app.families.family import AnyFamily, Registration
+from app.families.surveys import ColumnValues, MarkerRules
 from app.registry import decodes as registry_observations
 from app.registry import markers as store
 from app.registry.audit import recording
@@ -109,7 +109,7 @@ Step = Callable[[sa.Connection], MarkerDocument]
 class MarkerChange:
     """What to change: `values` by column, the position if it is to be replaced, `spec` by family and member."""
 
-    values: dict[str, Any] = field(default_factory=dict)
+    values: ColumnValues = field(default_factory=dict)
     position: PositionIn | None = None
     kind: str | None = None
     reason: str | None = None
@@ -314,7 +314,7 @@ class Markers:
         return Registration(caller.agency_id, now, self._rules, self._database, self._random_bits)
 
 
-def _family(row: MarkerRow) -> Family[Any, Any]:
+def _family(row: MarkerRow) -> AnyFamily:
     return get_family(row.family)
 
 
@@ -322,7 +322,7 @@ def _with_warnings(document: MarkerDocument, found: list[WarningDocument]) -> Ma
     return {**document, "position_warnings": found} if found else document
 
 
-def _spec_changes(family: Family[Any, object], change: MarkerChange) -> dict[str, object]:
+def _spec_changes(family: AnyFamily, change: MarkerChange) -> dict[str, object]:
     """Members of the spec that change; InvalidParameter where they are another family's."""
     for name, members in change.spec.items():
         if name != family.name:

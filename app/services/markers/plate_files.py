@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from app.encoders.plate import ArtworkFormat, ArtworkOptions, PlateOrder, PlateReader, prove_plate, write_artwork
 from app.encoders.plate import encode_plate as draw_plate
 from app.errors import InvalidParameter
+from app.families.plate.plates import GeometryIn
 from app.formats.images import ImageLimits, load_image
 from app.markers.plate import RECOMMENDED_POSITION_SCHEME, PlateCode, PlateGeometry, PlateScheme, recommended_geometry
 from app.markers.reading import PlateReading
@@ -17,13 +18,10 @@ from app.services.decodes.frame_documents import FramesResult, ReadFrame, ReadMa
 def plate_for(
     position: tuple[float, float] | None,
     registry_number: int | None,
+    size: GeometryIn,
     *,
     scheme: str = RECOMMENDED_POSITION_SCHEME,
     check_digits: int | None = None,
-    n: int | None = None,
-    unit_mm: float | None = None,
-    gap_mm: float = 5.0,
-    thickness_mm: float = 20.0,
 ) -> tuple[PlateCode, PlateGeometry]:
     """Code and dimensions of a plate that is asked for by position or by registry number.
 
@@ -35,8 +33,6 @@ def plate_for(
         Of positions.
     check_digits : int, optional
         Of the scheme ``position-check``: 1 or 2.
-    n, unit_mm, gap_mm, thickness_mm
-        As in `recommended_geometry`.
 
     Raises
     ------
@@ -65,7 +61,7 @@ def plate_for(
             cure=f"choose the scheme {PlateScheme.POSITION_CHECK}, or leave the check digits out",
         )
     wanted = PlateScheme(scheme) if position is not None else PlateScheme.ID
-    geometry = recommended_geometry(wanted, n=n, unit_mm=unit_mm, gap_mm=gap_mm, thickness_mm=thickness_mm)
+    geometry = recommended_geometry(wanted, **size.model_dump())
     if position is not None:
         code = PlateCode.from_position(*position, n=geometry.n, scheme=wanted, check_digits=check_digits or 0)
         return code, geometry

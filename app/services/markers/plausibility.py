@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeAlias
+from collections.abc import Sequence
+from typing import Literal, TypeAlias
 
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
 from app.families.documents import WarningDocument
+from app.families.surveys import ColumnValues
 from app.formats.surveys.table import Fault
 from app.geodesy.systems import WGS84
 from app.registry import markers
@@ -155,7 +156,7 @@ _MAX_NEIGHBOURS = 100  # registered markers that a position is compared with
 
 
 def check_position(
-    connection: sa.Connection, agency_id: str, marker_id: str, values: Mapping[str, Any], mode: WarningMode
+    connection: sa.Connection, agency_id: str, marker_id: str, values: ColumnValues, mode: WarningMode
 ) -> list[WarningDocument]:
     """Warnings about a position that is to be stored.
 
@@ -163,7 +164,7 @@ def check_position(
     ----------
     marker_id : str
         Its marker, which is not compared with itself.
-    values : mapping
+    values : dict
         Columns of the marker.
     mode : str
         ``refuse``: raise at the first one.
@@ -192,7 +193,7 @@ def check_position(
     ]
 
 
-def _single_position(values: Mapping[str, Any]) -> SinglePosition:
+def _single_position(values: ColumnValues) -> SinglePosition:
     """With the coordinates as they were sent; those of a lane's markers in WGS 84."""
     original = values["original"]
     first, second, crs = values["lon_deg"], values["lat_deg"], WGS84

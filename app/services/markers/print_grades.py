@@ -92,7 +92,9 @@ class PrintGrades:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         if row.family != PLATE.name:
             raise InvalidParameter(
-                f"the marker {marker_id} is no plate but of the family {row.family}", field="marker_id",
-                limit="the id of a plate", cure="name the plate that was printed",
-            )  # fmt: skip
+                f"the marker {marker_id} is no plate but of the family {row.family}",
+                field="marker_id",
+                limit="the id of a plate",
+                cure="name the plate that was printed",
+            )
         return plate_code(row), plate_geometry(row)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 from dataclasses import dataclass
-from typing import Any
 
 import sqlalchemy as sa
 from typing_extensions import TypedDict
@@ -15,7 +14,7 @@ from app.encoders.magnet import SheetFormat
 from app.errors import InvalidParameter, NotFound
 from app.families import get_family
 from app.families.cerpm import CERPM, message_of, radio_of
-from app.families.family import Family
+from app.families.family import AnyFamily
 from app.families.surveys import RETIRED
 from app.geodesy import UNFIT_TEXT
 from app.markers.cerpm import MAX_SEQUENCE, derive_marker_key
@@ -134,9 +133,16 @@ class CerpmPrograms:
         ]
         if with_keys:
             numbers = sorted(int(row.digits) for row in rows)
-            said: dict[str, Any] = {"markers": len(rows), "first": numbers[0], "last": numbers[-1]}
             with self._database.write() as connection:
-                log_change(connection, caller, "marker-keys.handed-out", now=self._clock(), **said)
+                log_change(
+                    connection,
+                    caller,
+                    "marker-keys.handed-out",
+                    now=self._clock(),
+                    markers=len(rows),
+                    first=numbers[0],
+                    last=numbers[-1],
+                )
         return write_programs_csv(programs, with_keys=with_keys)
 
     def _make_key(self, caller: Caller) -> bytes:
@@ -222,7 +228,7 @@ class Layouts:
         row, family = self._get(caller, marker_id)
         return LayoutFile(family.write_sheet(row, form), form.media_type, f"{row.id}-r{row.version}.{form}")
 
-    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, Family[Any, object]]:
+    def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, AnyFamily]:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         family = get_family(row.family)

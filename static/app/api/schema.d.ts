@@ -2577,7 +2577,7 @@ export interface components {
             /** @default 150 */
             resolution_dpi?: number;
             /** @default null */
-            sheet?: components["schemas"]["SheetIn"] | null;
+            sheet?: components["schemas"]["SheetSize"] | null;
             /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
         };
@@ -6424,7 +6424,7 @@ export interface components {
         };
         /** @enum {string} */
         SheetFormat: "pdf" | "csv" | "geojson";
-        SheetIn: {
+        SheetSize: {
             height_mm: number;
             width_mm: number;
         };
