@@ -85,8 +85,8 @@ def test_corners_are_found_to_a_fraction_of_a_pixel(views: list[Photo]) -> None:
 
 
 def test_further_coefficients_are_there_where_they_show_or_are_asked_for(views: list[Photo]) -> None:
-    assert len(calibrated(views, coefficients=5).distortion) == 5
-    assert len(calibrated(views, coefficients=8).distortion) == 8
+    assert len(calibrated(views, coefficients=5).camera.distortion) == 5
+    assert len(calibrated(views, coefficients=8).camera.distortion) == 8
     with pytest.raises(InvalidParameter):
         calibrated(views, coefficients=6)
     bent = TrueCamera(distortion=(-0.30, 0.18, 0.0, 0.0, -0.06))
@@ -96,7 +96,7 @@ def test_further_coefficients_are_there_where_they_show_or_are_asked_for(views: 
         corners = true_corners_px(bent, pose)[view.view.corner] + noise
         shown.append(replace(view, view=replace(view.view, corners_px=corners)))
     found = calibrated(shown)
-    assert len(found.distortion) == 5
+    assert len(found.camera.distortion) == 5
     assert found.camera.distortion[4] == pytest.approx(-0.06, abs=5 * found.sigma.distortion[4])
 
 
