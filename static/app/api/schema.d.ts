@@ -2661,13 +2661,6 @@ export interface components {
             materials: components["schemas"]["CostDocument"][];
             total_usd: number;
         };
-        Board: {
-            columns: number;
-            dictionary: string;
-            marker_mm: number;
-            rows: number;
-            square_mm: number;
-        };
         /** @enum {string} */
         BoundaryStyle: "solid" | "dashed" | "none" | "unknown";
         BuiltMarker: {
@@ -2718,6 +2711,11 @@ export interface components {
         CalibrationBoard: {
             /** @default 7 */
             columns?: number;
+            /**
+             * @default DICT_5X5_100
+             * @constant
+             */
+            dictionary?: "DICT_5X5_100";
             /** @default 18 */
             marker_mm?: number;
             /** @default 10 */
@@ -2734,7 +2732,8 @@ export interface components {
              *       "columns": 7,
              *       "rows": 10,
              *       "square_mm": 25,
-             *       "marker_mm": 18
+             *       "marker_mm": 18,
+             *       "dictionary": "DICT_5X5_100"
              *     }
              */
             board?: components["schemas"]["CalibrationBoard"];
@@ -2742,7 +2741,7 @@ export interface components {
             coefficients?: (4 | 5 | 8) | null;
         };
         CalibrationDocument: {
-            board: components["schemas"]["Board"];
+            board: components["schemas"]["CalibrationBoard"];
             camera: components["schemas"]["CalibratedCamera"];
             coverage: components["schemas"]["Coverage"];
             /** Format: date-time */
@@ -2750,25 +2749,14 @@ export interface components {
             decoder: string;
             id: string;
             rms_px: number;
-            sigma: components["schemas"]["CameraSigma"];
+            sigma: components["schemas"]["Intrinsics"];
             summary: string;
             tilt_spread_deg: number;
-            views: components["schemas"]["CalibrationView"][];
+            views: components["schemas"]["ViewReport"][];
             who: string;
         };
         CalibrationPage: {
             items: components["schemas"]["CalibrationDocument"][];
-        };
-        CalibrationView: {
-            corners: number;
-            detail: string | null;
-            edge_width_px: number | null;
-            name: string;
-            photo: number;
-            reason: string | null;
-            rms_px: number | null;
-            tilt_deg: number | null;
-            used: boolean;
         };
         CameraDeclaration: {
             /** @default 0 */
@@ -2835,13 +2823,6 @@ export interface components {
             rolling_shutter_s?: number;
             /** @default 1920 */
             width_px?: number;
-        };
-        CameraSigma: {
-            cx_px: number;
-            cy_px: number;
-            distortion: number[];
-            fx_px: number;
-            fy_px: number;
         };
         CanDeclaration: {
             /** @default null */
@@ -3202,6 +3183,22 @@ export interface components {
         Coverage: {
             cells: number[][];
             share: number;
+        };
+        Criteria: {
+            /** @default null */
+            bbox?: number[] | null;
+            /** @default null */
+            decoder?: string | null;
+            /** @default null */
+            kinds?: components["schemas"]["DecodeKind"][] | null;
+            /** @default null */
+            older_than?: string | null;
+            /** @default null */
+            since?: string | null;
+            /** @default null */
+            until?: string | null;
+            /** @default null */
+            vehicle_id?: string | null;
         };
         DamageReport: {
             /** Format: date-time */
@@ -4231,6 +4228,13 @@ export interface components {
             segment_m: number;
             text: string;
             tuple: string;
+        };
+        Intrinsics: {
+            cx_px: number;
+            cy_px: number;
+            distortion: number[];
+            fx_px: number;
+            fy_px: number;
         };
         ItemEvidence: {
             elsewhere_lat_deg?: number;
@@ -6099,22 +6103,6 @@ export interface components {
             total: number;
             who: string;
         };
-        ReprocessingIn: {
-            /** @default null */
-            bbox?: number[] | null;
-            /** @default null */
-            decoder?: string | null;
-            /** @default null */
-            kinds?: components["schemas"]["DecodeKind"][] | null;
-            /** @default null */
-            older_than?: string | null;
-            /** @default null */
-            since?: string | null;
-            /** @default null */
-            until?: string | null;
-            /** @default null */
-            vehicle_id?: string | null;
-        };
         ReprocessingLinks: {
             csv: string;
             report: string;
@@ -7082,6 +7070,19 @@ export interface components {
         VersionKind: "as-planned" | "as-built" | "resurvey" | "correction" | "change";
         VersionPage: {
             items: components["schemas"]["VersionDocument"][];
+        };
+        /** @enum {string} */
+        ViewFault: "no-board" | "wrong-board" | "mirrored" | "too-few-corners" | "blurred" | "other-size" | "alike" | "does-not-fit" | "not-a-picture" | "unreadable" | "too-large";
+        ViewReport: {
+            corners: number;
+            detail: string | null;
+            edge_width_px: number | null;
+            name: string;
+            photo: number;
+            reason: components["schemas"]["ViewFault"] | null;
+            rms_px: number | null;
+            tilt_deg: number | null;
+            used: boolean;
         };
         WarningDocument: {
             code: string;
@@ -10973,7 +10974,7 @@ export interface operations {
         };
         requestBody: {
             content: {
-                "application/json": components["schemas"]["ReprocessingIn"];
+                "application/json": components["schemas"]["Criteria"];
             };
         };
         responses: {
