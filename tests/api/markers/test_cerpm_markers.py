@@ -101,3 +101,11 @@ def test_what_does_not_fit_is_refused_with_its_field(
     assert refused.json()["field"].endswith(field)
     assert refused.json()["limit"]
     assert client.get("/v1/markers", params={"family": "cerpm"}).json()["items"] == []
+
+
+def test_an_unknown_member_of_the_radio_is_refused_with_the_nearest_known_one(
+    client: httpx.Client, place: Place
+) -> None:
+    refused = client.post("/v1/markers", json=cerpm(place(), radio={"spreding_factor": 7}))
+    assert (refused.status_code, refused.json()["field"]) == (422, "radio.spreding_factor")
+    assert "did you mean spreading_factor?" in refused.json()["cure"]

@@ -486,10 +486,10 @@ def test_the_documented_examples_and_members(client: httpx.Client) -> None:
         for part, schema in (("lane", "LaneDocument"), ("bill", "BillDocument")):
             assert set(made[part]) == set(schemas[schema]["properties"])
         assert set(made["magnets"][0]) == set(schemas["HoleDocument"]["properties"])
-        assert set(made["checks"][0]) == set(schemas["CheckDocument"]["properties"])
+        assert set(made["checks"][0]) == set(schemas["Check"]["properties"])
     assert set(tag["code"]) == set(schemas["InformationTagDocument"]["properties"])
     assert set(line["code"]) == set(schemas["LineTagDocument"]["properties"])
-    assert set(line["layout"]) == set(schemas["LinePlaceDocument"]["properties"])
+    assert set(line["layout"]) == set(schemas["LinePlace"]["properties"])
     for item in client.get("/v1/markers").json()["items"]:
         assert set(item) == set(schemas["MagnetDocument"]["required"])
 
