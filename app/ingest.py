@@ -21,6 +21,7 @@ import structlog
 from paho.mqtt.enums import CallbackAPIVersion
 
 from app.errors import InvalidParameter, NotAllowed, Unavailable
+from app.values import JsonObject
 
 # === Messages on disk until the server has accepted them. No message that was acknowledged to a broker is lost.
 
@@ -46,7 +47,7 @@ class Spool:
         self.messages = self._count()
         """Number of messages in the file that is appended to."""
 
-    def add(self, messages: Iterable[dict[str, Any]]) -> None:
+    def add(self, messages: Iterable[JsonObject]) -> None:
         """Append messages; they are on the disk when this returns."""
         lines = [orjson.dumps(message) + b"\n" for message in messages]
         self._file.write(b"".join(lines))
@@ -69,7 +70,7 @@ class Spool:
         """Batches that wait, oldest first."""
         return sorted(self._folder.glob(_BATCH), key=lambda path: path.stat().st_mtime_ns)
 
-    def refuse(self, batch: Path, why: dict[str, Any]) -> None:
+    def refuse(self, batch: Path, why: JsonObject) -> None:
         """Set aside a batch that the server refused finally, with the problem document."""
         (self._refused / f"{batch.stem}.problem.json").write_bytes(orjson.dumps(why, option=orjson.OPT_INDENT_2))
         batch.rename(self._refused / batch.name)
@@ -129,7 +130,7 @@ class Sink:
     # `server`, `key`: waymark's URL and a key with the scope `vehicle`
     server: str
     key: str
-    context: dict[str, Any] = field(default_factory=dict)  # of each upload, as POST /v1/decodes takes it
+    context: JsonObject = field(default_factory=dict)  # of each upload, as POST /v1/decodes takes it
     # `batch_messages`, `batch_s`: [s] a batch is sent when it has so many messages, or is so old
     batch_messages: int = 1000
     batch_s: float = 10.0
@@ -147,7 +148,7 @@ class MqttIngest:
     """
 
     def __init__(
-        self, source: MqttSource, sink: Sink, folder: Path, on_decode: Callable[[dict[str, Any]], None] | None = None
+        self, source: MqttSource, sink: Sink, folder: Path, on_decode: Callable[[JsonObject], None] | None = None
     ) -> None:
         self._source, self._sink = source, sink
         self._spool = Spool(folder)
@@ -296,7 +297,7 @@ class MqttIngest:
         self.stop()
 
 
-def _entry(message: mqtt.MQTTMessage, received_at: str) -> dict[str, Any] | None:
+def _entry(message: mqtt.MQTTMessage, received_at: str) -> JsonObject | None:
     """A message with its topic as a line of the log; None for one that is no JSON object."""
     try:
         if len(message.payload) > _MAX_TEXT_BYTES:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import Depends, Request, Response
 from fastapi.responses import StreamingResponse
@@ -45,6 +45,7 @@ from app.services.surveys.import_report import (
     import_input,
 )
 from app.services.surveys.imports import Imports as ImportsService
+from app.values import JsonObject
 
 # === /v1/imports: surveys come in.
 
@@ -180,7 +181,7 @@ class ExportIn(StrictModel):
     status: Status | None = None
     family: FamilyName | None = None
 
-    def wanted(self) -> dict[str, Any]:
+    def wanted(self) -> JsonObject:
         """What is wanted, checked, as it is stored in a job."""
         if self.bbox is not None:
             checked_box(*self.bbox)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from email.utils import format_datetime
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 import anyio
 from anyio import to_thread
@@ -37,6 +37,7 @@ from app.services.uploads.quotas import UploadDocument
 from app.services.uploads.uploads import Grant, Uploads
 from app.services.uploads.uploads import Uploads as UploadsService
 from app.storage.blobs import PART_BYTES
+from app.values import JsonObject
 
 # === Request and response headers of tus 1.0 (https://tus.io/protocols/resumable-upload).
 
@@ -272,7 +273,7 @@ _NO_CONTENT: Described = {204: {"description": "Done"}}
 _OPTIONS: Described = {200: {"description": "Tus-Version, Tus-Extension, Tus-Max-Size and Tus-Checksum-Algorithm"}}
 
 
-def _body(required: bool, **others: object) -> dict[str, Any]:
+def _body(required: bool, **others: object) -> JsonObject:
     return {"requestBody": {"required": required, "content": {BODY: {"schema": BINARY}, **others}}}
 
 

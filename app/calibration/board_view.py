@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.camera import CalibrationBoard, board_dictionary
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 
 MIN_CORNERS, MIN_SHARE = 8, 0.2

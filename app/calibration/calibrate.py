@@ -26,8 +26,7 @@ from app.calibration.board_view import (
 )
 from app.errors import CalibrationRefused, InvalidParameter, UnreadableUpload, WaymarkError
 from app.sensors.camera import CalibrationBoard
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 VERSION = "calibration/1"
 COEFFICIENTS = (4, 5, 8)

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
 from app.errors import InvalidParameter
 from app.settings import Settings
+from app.values import JsonObject
 
 if TYPE_CHECKING:
     from app.control.operations import Values
@@ -29,7 +30,7 @@ _NEAR = 0.88
 def read_settings(**overrides: object) -> Settings:
     """Settings from the environment; overrides that are None are ignored."""
     _check_names()
-    given: dict[str, Any] = {name: value for name, value in overrides.items() if value is not None}
+    given: JsonObject = {name: value for name, value in overrides.items() if value is not None}
     folder = os.environ.get("WAYMARK_SECRETS_DIR", "")
     if folder and not Path(folder).is_dir():
         raise InvalidParameter(f"{folder} is not a folder", field="WAYMARK_SECRETS_DIR")

@@ -7,7 +7,6 @@ import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
 
 import orjson
 
@@ -15,6 +14,7 @@ from app.errors import UnreadableUpload
 from app.planning.outputs.plan_document import read_plan
 from app.planning.proof import ProofReport, ProofTerms, ProofUnit, UnitResult, summarize
 from app.planning.proof.prove import Prover
+from app.values import JsonObject
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished units and of all."""
@@ -57,7 +57,7 @@ def run_proof(plan_file: Path, terms: ProofTerms, results_file: Path, workers: i
     return summarize(prover.plan, terms, [results[unit.key] for unit in units])
 
 
-def _finished(results_file: Path, header: dict[str, Any]) -> dict[str, UnitResult]:
+def _finished(results_file: Path, header: JsonObject) -> dict[str, UnitResult]:
     """Results of an earlier run of the same; the file is left with whole lines of it, or removed."""
     if not results_file.exists():
         return {}

@@ -9,12 +9,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from app.cli.terminal import JsonOption, Progress
 from app.errors import InvalidParameter, Unavailable, WaymarkError
+from app.values import JsonObject
 
 if TYPE_CHECKING:
     import httpx
@@ -179,7 +180,7 @@ def upload(
         raise _failure(decode)
 
 
-def _sent(client: httpx.Client, file: Path, context: str, shown: Progress) -> dict[str, Any]:
+def _sent(client: httpx.Client, file: Path, context: str, shown: Progress) -> JsonObject:
     """Send a file; returns its decode, which may be a job still."""
     if file.stat().st_size > _SMALL_BYTES:
         return _checked(client.get(ResumableUpload(client, file, context, shown, _checked).send()))
@@ -268,7 +269,7 @@ def _box(text: str) -> list[float]:
         ) from error  # fmt: skip
 
 
-def follow_job(client: httpx.Client, job_id: str, shown: Progress) -> dict[str, Any]:
+def follow_job(client: httpx.Client, job_id: str, shown: Progress) -> JsonObject:
     """Follow a job by server-sent events until it ends; a stream that is cut is opened again."""
     import httpx
 
@@ -290,7 +291,7 @@ def follow_job(client: httpx.Client, job_id: str, shown: Progress) -> dict[str, 
             time.sleep(_RETRY_S)
 
 
-def _show_job(shown: Progress, job: dict[str, Any], *, is_done: bool = False) -> None:
+def _show_job(shown: Progress, job: JsonObject, *, is_done: bool = False) -> None:
     """A job by its steps, where they are counted."""
     if job["total"]:
         shown.show(job["kind"], job["total"] if is_done else job["done"], job["total"])
@@ -358,7 +359,7 @@ def _multipart(file: Path, context: str) -> tuple[Iterator[bytes], dict[str, str
     return parts(), {"Content-Type": f"multipart/form-data; boundary={boundary}", "Content-Length": str(size)}
 
 
-def _checked(response: httpx.Response) -> dict[str, Any]:
+def _checked(response: httpx.Response) -> JsonObject:
     """The document of a response.
 
     Raises
@@ -367,7 +368,7 @@ def _checked(response: httpx.Response) -> dict[str, Any]:
         The server refused the request.
     """
     try:
-        document: dict[str, Any] = response.json()
+        document: JsonObject = response.json()
     except ValueError:
         document = {}
     if response.is_success:
@@ -376,7 +377,7 @@ def _checked(response: httpx.Response) -> dict[str, Any]:
     raise WaymarkError(message, limit=document.get("limit"), cure=document.get("cure"))
 
 
-def _failure(job: dict[str, Any]) -> WaymarkError:
+def _failure(job: JsonObject) -> WaymarkError:
     error = job.get("error") or {}
     return WaymarkError(
         error.get("detail") or f"it was {job['state']}", limit=error.get("limit"), cure=error.get("cure")

@@ -7,13 +7,14 @@ import signal
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from app.cli.database import owned_database, perform, read_settings
 from app.cli.terminal import collector_paused
 from app.errors import InvalidParameter, Unavailable
+from app.values import JsonObject
 
 HostOption = Annotated[str | None, typer.Option(help="Address to listen on. Default: WAYMARK_HOST, or 127.0.0.1.")]
 PortOption = Annotated[int | None, typer.Option(help="Port to listen on. Default: WAYMARK_PORT, or 8000.")]
@@ -48,7 +49,7 @@ def demo(
         raise typer.Exit(1)
 
 
-def _address_to_serve_on() -> dict[str, Any]:
+def _address_to_serve_on() -> JsonObject:
     """Host, and port if the environment has one: by default the demo takes any free port."""
     from app.cli.serving import check_port
 

@@ -20,6 +20,7 @@ from app.decoders.snapshot import Snapshot, SnapshotMarker
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting, codewords, get_dictionary
 from app.markers.reading import PlatePose
 from app.sensors.camera import Camera
+from app.values import Floats
 
 # === What was read of a fiducial sign in a frame.
 
@@ -54,7 +55,6 @@ class FiducialReading:
 
 
 Image = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float64]
 
 _CELL_PX = 8  # [px] of a module in the rectified picture; its inner half is sampled; 16 samples a module
 _NEXT_SQUARE = 0.02  # [-] of the perimeter: a border inside the edge of its panel is a square of its own
@@ -194,8 +194,6 @@ def _module_px(corners_px: Floats, n: int) -> float:
 # weigh the corners against the mounting.
 
 
-Array = npt.NDArray[np.float64]
-
 CORNER_SIGMA_PX = 0.1
 """Of a corner in each direction. [px] The rest over 0.035 on rendered frames, as
 tests/families/fiducial/test_fiducial_frames.py prints it, is left for lenses."""
@@ -208,7 +206,7 @@ _ROUNDS = 10  # of Gauss-Newton; two or three suffice
 _SIGN_FROM_PLATE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def locate_fiducial(corners_px: Array, geometry: FiducialGeometry, camera: Camera) -> PlatePose | None:
+def locate_fiducial(corners_px: Floats, geometry: FiducialGeometry, camera: Camera) -> PlatePose | None:
     """Pose of a sign from the corners of its border.
 
     Parameters
@@ -247,14 +245,14 @@ def locate_fiducial(corners_px: Array, geometry: FiducialGeometry, camera: Camer
 
 
 def _refine(
-    pose: Array, corners_px: Array, object_m: Array, mounting: Mounting, camera: Camera, distortion: Array
-) -> tuple[float, Array, Array] | None:
+    pose: Floats, corners_px: Floats, object_m: Floats, mounting: Mounting, camera: Camera, distortion: Floats
+) -> tuple[float, Floats, Floats] | None:
     """Gauss-Newton on corners and mounting: cost, pose (rotation vector, translation), information.
 
     Small rotations are about the camera's axes, to the left of the pose's rotation.
     """
 
-    def residuals(at: Array) -> Array:
+    def residuals(at: Floats) -> Floats:
         corners = _corner_residuals(at, corners_px, object_m, camera, distortion) / CORNER_SIGMA_PX
         return np.concatenate([corners, _tilt(at, mounting, camera) / TILT_SIGMA_RAD])
 
@@ -280,17 +278,17 @@ def _refine(
     return (cost, pose, information) if math.isfinite(cost) else None
 
 
-def _moved(pose: Array, step: Array) -> Array:
+def _moved(pose: Floats, step: Floats) -> Floats:
     rotation = cv2.Rodrigues(step[:3])[0] @ cv2.Rodrigues(pose[:3])[0]
     return np.concatenate([cv2.Rodrigues(rotation)[0].ravel(), pose[3:] + step[3:]])
 
 
-def _corner_residuals(pose: Array, corners_px: Array, object_m: Array, camera: Camera, distortion: Array) -> Array:
+def _corner_residuals(pose: Floats, corners_px: Floats, object_m: Floats, camera: Camera, distortion: Floats) -> Floats:
     projected = cv2.projectPoints(object_m, pose[:3], pose[3:], camera.matrix, distortion)[0]
     return np.asarray(projected, dtype=np.float64).reshape(8) - corners_px.reshape(8)
 
 
-def _tilt(pose: Array, mounting: Mounting, camera: Camera) -> Array:
+def _tilt(pose: Floats, mounting: Mounting, camera: Camera) -> Floats:
     """How far the axis of the sign that should be vertical leans forward and to the left of the vehicle. [rad]"""
     rotation = np.asarray(cv2.Rodrigues(pose[:3])[0], dtype=np.float64)
     axis = rotation[:, 1] if mounting is Mounting.UPRIGHT else rotation[:, 2]

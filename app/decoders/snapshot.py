@@ -38,12 +38,13 @@ from app.markers.magnet_design import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import STATUSES, position_warnings
 from app.markers.snapshot import Trust
+from app.values import JsonObject
 
 _GEOD = Geod(ellps="WGS84")
 _M_PER_DEG = 110_574.0  # [m] least length of a degree of latitude; source: WGS 84 at the equator
 _CLOCK_SLACK = timedelta(minutes=10)  # that a vehicle's clock may be slow
 _KM_H = {"km/h": 1.0, "mph": 1.609344}
-_Columns = dict[str, Any]  # arrays or values, by the names of `app.markers.snapshot.COLUMNS`
+_Columns = JsonObject  # arrays or values, by the names of `app.markers.snapshot.COLUMNS`
 _CURE = "fetch the snapshot again"
 
 
@@ -97,7 +98,7 @@ class Snapshot:
     """The markers of an area, verified. `open_snapshot` makes one."""
 
     def __init__(
-        self, header: np.void, columns: _Columns, kinds: list[dict[str, Any]], codes: bytes, books: list[Any]
+        self, header: np.void, columns: _Columns, kinds: list[JsonObject], codes: bytes, books: list[Any]
     ) -> None:
         self.version = int(header["version"])
         self.made_at_ms = int(header["made_at_ms"])

@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
-from typing import Any
 
 import cv2
 import httpx
 import numpy as np
-import numpy.typing as npt
 
 from app.demo.server import checked
 from app.demo.table import LaneResult
@@ -30,8 +28,7 @@ from app.simulation.radio.drive import SatelliteReceiver, SimulatedDrive, drive_
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_from_wgs84
 from app.simulation.radio.link import Radio
 from app.simulation.steering import PoseNoise, check_steering
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats, JsonObject
 
 INTERVAL_S = 1.6  # [s] at 20 dBm the transmitter may send 1 % of the time: `app.radio.settings`
 SPEED_KM_H = 30
@@ -126,7 +123,7 @@ def build_lane(client: httpx.Client, rng: np.random.Generator) -> BuiltLane:
 def drive_lane_and_judge(
     client: httpx.Client, built: BuiltLane, drive: LaneDrive, number: int, before: Sequence[ReceivedPacket],
     rng: np.random.Generator,
-) -> tuple[LaneResult, dict[str, Any], bytes, dict[str, Any], list[ReceivedPacket]]:  # fmt: skip
+) -> tuple[LaneResult, JsonObject, bytes, JsonObject, list[ReceivedPacket]]:  # fmt: skip
     """Drive past what is built, upload what was received, compare with the truth.
 
     Returns
@@ -167,7 +164,7 @@ def drive_lane_and_judge(
         "file": ("drive.zip", recording, "application/zip"),
         "context": ("context", json.dumps(context).encode(), "application/json"),
     }
-    decode: dict[str, Any] = checked(client.post("/v1/decodes", files=parts)).json()
+    decode: JsonObject = checked(client.post("/v1/decodes", files=parts)).json()
     return judge_lane(built, drive, moved, simulated, decode), decode, recording, context, list(simulated.packets)
 
 
@@ -176,7 +173,7 @@ def _sign(built: BuiltLane, message: CerpmMessage) -> bytes:
 
 
 def judge_lane(
-    built: BuiltLane, drive: LaneDrive, moved: int | None, simulated: SimulatedDrive, decode: dict[str, Any]
+    built: BuiltLane, drive: LaneDrive, moved: int | None, simulated: SimulatedDrive, decode: JsonObject
 ) -> LaneResult:
     """The server's answer against what was simulated."""
     verdicts, lane = decode["report"]["verdicts"], decode["lane"]

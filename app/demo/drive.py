@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +19,7 @@ from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Drive, draw_daylight, drive_over_plate
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlateScene, face_truth
+from app.values import JsonObject
 
 # === A lane's boundaries -> places on its centre line.
 
@@ -38,7 +38,7 @@ class LanePlace:
     chainage_m: float  # [m] along the lane
 
 
-def list_lane_places(lane: dict[str, Any], chainages_m: npt.ArrayLike, height_m: float) -> list[LanePlace]:
+def list_lane_places(lane: JsonObject, chainages_m: npt.ArrayLike, height_m: float) -> list[LanePlace]:
     """Places along a lane.
 
     Parameters
@@ -221,7 +221,7 @@ def _with_truth(jpeg: bytes, rows: float, scene: PlateScene, place: LanePlace, r
     return DemoFrame(jpeg, rows, lon, lat, heading_deg, context)
 
 
-def registered_code(marker: dict[str, Any]) -> PlateCode:
+def registered_code(marker: JsonObject) -> PlateCode:
     """The code of a marker as the API describes it."""
     code = marker["code"]
     scheme = PlateScheme(code["scheme"])

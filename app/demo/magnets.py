@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
-import numpy.typing as npt
 
 from app.demo.server import checked
 from app.demo.table import TraceResult
@@ -26,6 +24,7 @@ from app.simulation.magnetic.clutter import Clutter
 from app.simulation.magnetic.drive import Course, Scene, SimulatedDrive, TrueMagnet, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet
+from app.values import Floats, JsonObject
 
 LENGTH_M, BEND = 350.0, (150.0, 230.0, 260.0)
 ORIGIN = (8.4133, 49.0058, 165.0)
@@ -34,9 +33,8 @@ LINES = {LineStyle.DASHED: 1.75, LineStyle.SOLID: -1.75}
 STOP_LINE_M = 340.0
 SURVEY_RMSE_M = 0.01
 _KMH = 1 / 3.6
-Floats = npt.NDArray[np.float64]
 
-BOOK: dict[str, Any] = {
+BOOK: JsonObject = {
     "name": "Demo lane",
     "design": {"magnets": 3, "length_m": 4.0, "segment_m": 1.0},
     "rules": {"speed_m_s": 13.9, "clearance_m": 0.3, "wrong_way_safe": True},
@@ -127,8 +125,8 @@ class Built:
     """Registered magnets on the lane."""
 
     lane: Lane
-    tags: list[dict[str, Any]] = field(default_factory=list)
-    lines: list[dict[str, Any]] = field(default_factory=list)
+    tags: list[JsonObject] = field(default_factory=list)
+    lines: list[JsonObject] = field(default_factory=list)
 
     def scene(self, drive: TraceDrive) -> tuple[Scene, Lane]:
         """The scene of a drive: tags at their planned chainages, lines at the holes of their sheets."""
@@ -180,7 +178,7 @@ def _body(lane: Lane, left_m: float) -> dict[str, object]:
     return {"family": "magnet", "road": "Karlsruhe, magnet lane", "lane": {"geometry": geometry, **source}}
 
 
-def _survey(client: httpx.Client, marker: dict[str, Any], rng: np.random.Generator) -> None:
+def _survey(client: httpx.Client, marker: JsonObject, rng: np.random.Generator) -> None:
     hole = marker["magnets"][0]
     error_m = np.array([*rng.standard_normal(2) * SURVEY_RMSE_M / np.sqrt(2), 0.0])
     lon_deg, lat_deg, _height = wgs84_from_enu(error_m, (hole["lon_deg"], hole["lat_deg"], ORIGIN[2]))
@@ -204,7 +202,7 @@ _WAIT_S = 120.0
 
 def drive_and_judge(
     client: httpx.Client, built: Built, drive: TraceDrive, rng: np.random.Generator
-) -> tuple[TraceResult, dict[str, Any], bytes, dict[str, Any]]:
+) -> tuple[TraceResult, JsonObject, bytes, JsonObject]:
     """Drive over what is built.
 
     Returns
@@ -228,7 +226,7 @@ def drive_and_judge(
 
 
 def judge_drive(
-    built: Built, drive: TraceDrive, lane: Lane, simulated: SimulatedDrive, decode: dict[str, Any]
+    built: Built, drive: TraceDrive, lane: Lane, simulated: SimulatedDrive, decode: JsonObject
 ) -> TraceResult:
     """The server's answer against what was simulated."""
     t_s = simulated.trace.t_s
@@ -249,7 +247,7 @@ def _pack(drive: SimulatedDrive) -> bytes:
     return packed.getvalue()
 
 
-def _upload(client: httpx.Client, recording: bytes, context: dict[str, Any]) -> dict[str, object]:
+def _upload(client: httpx.Client, recording: bytes, context: JsonObject) -> dict[str, object]:
     body = json.dumps(context).encode()
     parts = {"file": ("drive.zip", recording, "application/zip"), "context": ("context", body, "application/json")}
     decode: dict[str, object] = checked(client.post("/v1/decodes", files=parts)).json()
@@ -262,7 +260,7 @@ def _upload(client: httpx.Client, recording: bytes, context: dict[str, Any]) -> 
     return decode
 
 
-def _judge_magnets(result: TraceResult, drive: SimulatedDrive, readings: Sequence[dict[str, Any]]) -> None:
+def _judge_magnets(result: TraceResult, drive: SimulatedDrive, readings: Sequence[JsonObject]) -> None:
     """Assign the nearest reading to each magnet under the bar; others are false, except at magnets beside the bar."""
     left = list(readings)
     beside = [magnet for magnet in drive.magnets if abs(magnet.lateral_cm) > _UNDER_CM]
@@ -278,13 +276,13 @@ def _judge_magnets(result: TraceResult, drive: SimulatedDrive, readings: Sequenc
     result.false = sum(not any(_is_near(r, magnet) for magnet in beside) for r in left)
 
 
-def _is_near(reading: dict[str, Any], magnet: TrueMagnet) -> bool:
+def _is_near(reading: JsonObject, magnet: TrueMagnet) -> bool:
     off_m = abs(reading["t_s"] - magnet.t_s) * magnet.speed_m_s
     return off_m < _REACH_M and bool(abs(reading["lateral_cm"] - magnet.lateral_cm) < 100 * _REACH_M)
 
 
 def _judge_tags(
-    result: TraceResult, built: Built, lane: Lane, drive: SimulatedDrive, readings: Sequence[dict[str, Any]]
+    result: TraceResult, built: Built, lane: Lane, drive: SimulatedDrive, readings: Sequence[JsonObject]
 ) -> None:
     markers = built.tags[::-1] if result.wrong_way else built.tags
     chainages_m = [tag.chainage_m for tag in drive.tags]
@@ -314,7 +312,7 @@ def _judge_tags(
 
 
 def _judge_departures(
-    style: str, magnets: Sequence[TrueMagnet], crossings: Sequence[dict[str, Any]]
+    style: str, magnets: Sequence[TrueMagnet], crossings: Sequence[JsonObject]
 ) -> tuple[int, int, int]:
     """True positives, actual departures, false positives."""
     under = [

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import httpx
 
@@ -16,6 +15,7 @@ from app.demo.server import checked
 from app.demo.table import draw_rows
 from app.errors import WaymarkError
 from app.planning.rules import read_rules
+from app.values import JsonObject
 
 ROAD, RULES = "e6.xodr", "e6-rules.yaml"
 ORIGIN_DEG = (12.0, 57.6)  # near the E6 in Sweden; the file's own system cannot be used
@@ -33,7 +33,7 @@ class PlanResult:
     """A plan that was placed, checked, costed and proved."""
 
     plan: dict[str, object]  # as the server has it
-    proof: dict[str, Any] = field(default_factory=dict)  # its report
+    proof: JsonObject = field(default_factory=dict)  # its report
 
     @property
     def path_rms_m(self) -> list[float]:
@@ -53,7 +53,7 @@ def plan_road(client: httpx.Client, folder: Path) -> PlanResult:
     folder.mkdir(parents=True, exist_ok=True)
     data = files("app.demo") / "data"
     declaration = {"name": "E6", "origin": ORIGIN_DEG, "ignore_heights": True}
-    parts: dict[str, Any] = {
+    parts: JsonObject = {
         "file": (ROAD, data.joinpath(ROAD).read_bytes(), "application/xml"),
         "declaration": (None, json.dumps(declaration)),
     }
@@ -83,7 +83,7 @@ def prove_road(client: httpx.Client, made: PlanResult, folder: Path) -> None:
     made.plan = checked(client.get(path)).json()
 
 
-def describe_plan(plan: dict[str, Any]) -> list[str]:
+def describe_plan(plan: JsonObject) -> list[str]:
     """What was placed, what it costs, and what the checks found."""
     counts = ", ".join(f"{plan['counts'][family]} {label}" for family, label in _FAMILIES.items())
     verdicts = [finding["verdict"] for finding in plan["findings"]]

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -24,6 +23,7 @@ from app.demo.table import LaneResult, Pass, TraceResult, draw_lane_table, draw_
 from app.errors import WaymarkError
 from app.geodesy import enu_from_wgs84
 from app.sensors.pose_track import ReceivedPacket
+from app.values import JsonObject
 
 _SEED = 7
 _FORMATS = ("svg", "pdf", "dxf", "png")
@@ -153,7 +153,7 @@ def _demonstrate(client: httpx.Client, out: Path, say: Say) -> tuple[list[Pass],
     ]
 
 
-def _fetch_artwork(client: httpx.Client, marker: dict[str, Any], folder: Path) -> int:
+def _fetch_artwork(client: httpx.Client, marker: JsonObject, folder: Path) -> int:
     """Download a plate's artwork in every format."""
     for form in _FORMATS:
         answer = checked(client.get(f"/v1/markers/{marker['id']}/artwork.{form}"))
@@ -167,7 +167,7 @@ def _drive(
     client: httpx.Client,
     name: str,
     plate: DemoPlate,
-    marker: dict[str, Any],
+    marker: JsonObject,
     rng: np.random.Generator,
     shown: _Shown,
     rows: list[dict[str, object]],
@@ -198,7 +198,7 @@ def _drive(
     return result
 
 
-def _upload(client: httpx.Client, frame: DemoFrame) -> dict[str, Any]:
+def _upload(client: httpx.Client, frame: DemoFrame) -> JsonObject:
     context = json.dumps(frame.context).encode()
     parts = {"file": ("frame.jpg", frame.jpeg, "image/jpeg"), "context": ("context", context, "application/json")}
     decode: dict[str, object] = checked(client.post("/v1/decodes", files=parts)).json()

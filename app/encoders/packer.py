@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from typing import Any
+
+from app.values import JsonObject
 
 _LEVEL = 1  # of the compression; for speed
 
@@ -28,6 +29,6 @@ class Packer:
         self.entries.append(file_entry(name, content))
 
 
-def file_entry(name: str, content: bytes) -> dict[str, Any]:
+def file_entry(name: str, content: bytes) -> JsonObject:
     """What a manifest states of a file."""
     return {"name": name, "size": len(content), "sha256": hashlib.sha256(content).hexdigest()}

@@ -27,7 +27,6 @@ from app.families.family import Family, Registration, map_point
 from app.families.surveys import (
     ColumnValues,
     Commitment,
-    Flags,
     MarkerRules,
     PlannedRow,
     RowCodes,
@@ -51,6 +50,7 @@ from app.registry.column_types import row_of
 from app.registry.lines import CerpmRuns
 from app.registry.marker_rows import CodeRow, MarkerRow, markers
 from app.surveys.georeference import GeoreferencedSurvey
+from app.values import Bools
 
 # === The row of a CERPM as values of the core: what it sends, its side, its speed limit and its radio.
 
@@ -204,7 +204,7 @@ class CerpmSurvey(SurveyImport[CerpmSurveyIn]):
         return CerpmSurveyIn.model_validate(declared)
 
     def check_values(
-        self, survey: GeoreferencedSurvey, wanted: Flags, declaration: ImportDeclaration
+        self, survey: GeoreferencedSurvey, wanted: Bools, declaration: ImportDeclaration
     ) -> Iterator[Fault]:
         """Unknown sides, and heights that do not fit a message."""
         sides = {side.name for side in LaneSide}

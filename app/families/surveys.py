@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from app.registry.bulk_load import Columns
 from app.registry.conditions import grade_columns
 from app.registry.marker_rows import CodeRow, MarkerRow
 from app.surveys.georeference import GeoreferencedSurvey
+from app.values import Bools, JsonObject
 
 # === Limits that a deployment can set for markers, and the states that their rules ask about.
 
@@ -42,7 +43,7 @@ class MarkerRules:
     idempotency_ttl: timedelta = timedelta(hours=24)
 
 
-ColumnValues = dict[str, Any]
+ColumnValues = JsonObject
 """Values by column of `markers`: those of a new marker, or those that change."""
 
 
@@ -109,7 +110,6 @@ class Commitment:
 
 
 Rows = npt.NDArray[np.intp]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(slots=True)
@@ -118,10 +118,10 @@ class RowCodes:
 
     rows: Rows  # shape (N,): indices of the rows, rising
     digits: Digits  # shape (N,): empty where a code is still to be assigned
-    from_file: Flags  # bool, shape (N,): whether the file has it
+    from_file: Bools  # bool, shape (N,): whether the file has it
     scheme: str
 
-    def of(self, chosen: Flags | slice) -> RowCodes:
+    def of(self, chosen: Bools | slice) -> RowCodes:
         """The codes of some of the rows."""
         return RowCodes(self.rows[chosen], self.digits[chosen], self.from_file[chosen], self.scheme)
 
@@ -139,7 +139,7 @@ def listed_codes(survey: GeoreferencedSurvey, rows: Rows) -> Iterator[tuple[int,
         start += len(part)
 
 
-def unknown_texts(texts: Texts | None, wanted: Flags, name: str, known: set[str], limit: str) -> Iterator[Fault]:
+def unknown_texts(texts: Texts | None, wanted: Bools, name: str, known: set[str], limit: str) -> Iterator[Fault]:
     """Faults of the wanted rows whose text in a column is not a known one."""
     start = 0
     for part in texts.parts() if texts is not None else ():
@@ -175,7 +175,7 @@ class SurveyImport(ABC, Generic[DefaultsT]):
         """
 
     def check_values(
-        self, survey: GeoreferencedSurvey, wanted: Flags, declaration: ImportDeclaration
+        self, survey: GeoreferencedSurvey, wanted: Bools, declaration: ImportDeclaration
     ) -> Iterator[Fault]:
         """Faults of the wanted rows that no marker of this family can have."""
         yield from ()

@@ -25,6 +25,7 @@ from app.geodesy import place_position, reference_system
 from app.geodesy.systems import is_global
 from app.inputs import Declaration, Name, Number
 from app.sensors.pose_track import PoseTrack
+from app.values import Floats
 
 if TYPE_CHECKING:
     import gpxpy.gpx
@@ -141,8 +142,6 @@ def too_many_points(name: str, limits: PoseLimits) -> UploadTooLarge:
 
 # === Points of a track in the order of the file, and the track that they form.
 
-
-Floats = npt.NDArray[np.float64]
 
 FASTEST_M_S = 150.0
 """A point that can only be reached faster than this, from both sides, is an outlier. [m/s] 540 km/h."""

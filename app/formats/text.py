@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import TextIO
 
 import numpy as np
-import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload
+from app.values import Floats
 
 MAX_LINE = 1 << 18
 """Longest line that is read; longer ones are left out. [character]"""
@@ -225,8 +225,6 @@ def require_columns(file_name: str, found: Sequence[str], wanted: Iterable[str],
 # - `split_rows`: as RFC 4180 has it, where a quoted cell may span lines (surveys).
 # - `read_numbers_by_block`: columns of numbers, megabytes at a time (traces).
 
-
-Floats = npt.NDArray[np.float64]
 
 SPACES = "space"
 """The delimiter of rows whose cells are separated by any number of spaces and tabs."""

@@ -9,11 +9,10 @@ import numpy.typing as npt
 import pymap3d
 
 from app.errors import InvalidParameter
+from app.values import Floats
 
 # === The WGS 84 ellipsoid: its size, and lengths of small angles on it.
 
-
-Floats = npt.NDArray[np.float64]
 
 WGS84_A_M = 6378137.0  # [m] semi-major axis; source: NGA.STND.0036 (WGS 84), table 3.1
 WGS84_E2 = 0.0066943799901413165  # first eccentricity squared; source: NGA.STND.0036, table 3.3, from 1/298.257223563

@@ -19,6 +19,7 @@ from pyproj.transformer import TransformerGroup
 
 from app.geodesy.frames import ecef_from_wgs84, metres_per_radian
 from app.geodesy.systems import best_effort, covers, named_system
+from app.values import Floats
 
 _ITRF2014_2D, _ITRF2014_3D = "EPSG:9000", "EPSG:7912"
 _TIMELY = ("t_epoch", "defmodel")
@@ -121,8 +122,6 @@ def _own_folders() -> str:
 # plates and orogens of PB2002 (Bird: An updated digital model of plate boundaries, Geochemistry Geophysics Geosystems
 # 4, 2003), in cells of one degree: `data/plates.txt` (made from github.com/fraxen/tectonicplates, ODC-By 1.0).
 
-
-Floats = npt.NDArray[np.float64]
 
 ANGULAR_VELOCITY_MAS = {
     "ANTA": (-0.248, -0.324, 0.675), "ARAB": (1.154, -0.136, 1.444), "AUST": (1.510, 1.182, 1.215),

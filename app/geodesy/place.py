@@ -33,6 +33,7 @@ from app.geodesy.systems import (
     system_of_realization,
     wgs84_without_bound,
 )
+from app.values import Floats
 
 # === What a position is good enough for, by its accuracy (docs/positions.md).
 
@@ -383,8 +384,6 @@ def _global_frame(name: str, place_deg: tuple[float, float], realization: str | 
 
 # === Positions in WGS 84 / ITRF to any reference system, with the accuracy of the transformation.
 
-
-Floats = npt.NDArray[np.float64]
 
 _INVERSE = TransformDirection.INVERSE
 _OUTSIDE_DEG = 1.0  # [deg] margin about an area of use; source: as for positions that come in

@@ -23,11 +23,10 @@ from app.health.states import (
     VehicleState,
     Verdict,
 )
+from app.values import Floats
 
 # === Likelihood ratios of the tests, for many markers at once.
 
-
-Floats = npt.NDArray[np.float64]
 
 DISPLACEMENT_M, DISPLACEMENT_SHARE = (1.5, 15.0), (0.9, 0.1)
 """Standard deviations of a moved marker's displacement before it is seen, each axis [m], and how common they are:

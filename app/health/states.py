@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from typing import Any
+
+from app.values import JsonObject
 
 # === Faults of markers, and the limits of the tests for them.
 
@@ -216,7 +217,7 @@ class MarkerState:
         return cls(family=family, levels=list(READING_LEVELS.get(family, READING_LEVELS["magnet"])[1]))
 
     @classmethod
-    def from_document(cls, document: dict[str, Any]) -> MarkerState:
+    def from_document(cls, document: JsonObject) -> MarkerState:
         """The state that `document` stored."""
         far = [
             FarEntry(entry["vehicle"], entry["at_s"], None if entry["place"] is None else tuple(entry["place"]))
@@ -224,7 +225,7 @@ class MarkerState:
         ]
         return cls(**{**document, "offsets": [OffsetEntry(**entry) for entry in document["offsets"]], "far": far})
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> JsonObject:
         """The state as JSON values."""
         named = {name: {str(fault): value for fault, value in getattr(self, name).items()} for name in _BY_FAULT}
         return {**asdict(self), **named}

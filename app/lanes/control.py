@@ -16,8 +16,7 @@ import scipy
 
 from app.compiled import ieee_kernel
 from app.errors import InvalidParameter
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 STEP_M = 0.25  # [m] between points of a followed path; source: 0.1 m driven a step at 36 km/h, 2 steps a point
 SHORTEST_M, LONGEST_M = 10.0, 100_000.0  # [m] of a path

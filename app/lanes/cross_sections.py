@@ -13,8 +13,7 @@ import numpy.typing as npt
 import scipy
 
 from app.errors import InvalidParameter
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 WIDTH_M = (1.5, 12.0)  # [m] narrowest and widest lane; a cycle lane and a wide ramp
 MAX_LENGTH_M = 200_000.0  # [m] bounds the time of a cut

@@ -21,20 +21,9 @@ from app.lanes.lane_fit import LaneFit
 from app.lanes.lane_path import compare_with_track, path_from_fit, path_from_splines, refused_path, runs_apart
 from app.lanes.observations import LaneObservations, distinct_places, observations_from_markers
 from app.lanes.smooth_line import SmoothLine, boundaries_by_splines, plane_from_wgs84
-from app.lanes.types import (
-    LEFT,
-    RIGHT,
-    UNKNOWN,
-    Bools,
-    Ints,
-    Lane,
-    LaneMarkers,
-    LaneRules,
-    LeftOut,
-    LeftOutReason,
-    Notes,
-)
+from app.lanes.types import LEFT, RIGHT, UNKNOWN, Lane, LaneMarkers, LaneRules, LeftOut, LeftOutReason, Notes
 from app.sensors.pose_track import PoseTrack
+from app.values import Bools, Ints
 
 __all__ = ["Lane", "LaneMarkers", "LaneRules", "LeftOut", "LeftOutReason", "fit_lane", "preview_m"]
 

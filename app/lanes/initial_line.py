@@ -9,8 +9,9 @@ import scipy
 
 from app.lanes.least_squares import difference_gram, factor, gather, gram, solve
 from app.lanes.smooth_line import SmoothLine, left_normals, lengths_along, plane_from_wgs84
-from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints
+from app.lanes.types import LEFT, RIGHT, UNKNOWN
 from app.sensors.pose_track import PoseTrack
+from app.values import Bools, Floats, Ints
 
 _NEIGHBOURS = 10  # of each marker in the graph; sensitivity 1.00, 1.00
 _BEND = 0.002  # [1/(m^2 sqrt(m))] change of curvature over a metre; sensitivity 1.01, 0.97

@@ -31,7 +31,8 @@ from app.lanes.observations import (
     nearest_sorted,
 )
 from app.lanes.smooth_line import SmoothLine, lengths_along
-from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints, LaneRules, LeftOutReason, Notes
+from app.lanes.types import LEFT, RIGHT, UNKNOWN, LaneRules, LeftOutReason, Notes
+from app.values import Bools, Floats, Ints
 
 # === Which boundary of the lane each marker stands on: the most likely course of the lane beside an initial line.
 

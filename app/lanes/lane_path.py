@@ -23,9 +23,6 @@ from app.lanes.types import (
     MAX_TRACK_SIGNIFICANCE,
     MIN_TRACK_EFFECT_M,
     UNKNOWN,
-    Bools,
-    Floats,
-    Ints,
     Lane,
     LaneRules,
     LeftOutReason,
@@ -33,6 +30,7 @@ from app.lanes.types import (
     TrackAgreement,
 )
 from app.sensors.pose_track import PoseTrack
+from app.values import Bools, Floats, Ints
 
 _MAX_WIDTH_SIGMA_M = 0.3  # [m] a width that is less certain is not published; an eighth of narrow lanes
 _MAX_BOUNDARY_SIGMA_M = 0.4  # [m] a boundary that is less certain is not published

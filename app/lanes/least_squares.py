@@ -21,22 +21,17 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from app.compiled import ieee_kernel
 from app.lanes.observations import NO_KNOWN_LENGTHS, KnownLengths
 from app.lanes.smooth_line import SmoothLine, left_normals
-from app.lanes.types import Floats as TypesFloats
-from app.lanes.types import Ints as TypesInts
+from app.values import Floats, Ints
 
 # === Least squares with unknowns along a line: the matrices are banded, so the cost is linear in the line's length.
 #
 # LAPACK is called directly: the checks of scipy.linalg cost more than matrices of this size.
 
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 _DIFFERENCES = ([1.0], [-1.0, 1.0], [1.0, -2.0, 1.0], [-1.0, 3.0, -3.0, 1.0])
 _LIFT, _LIFT_OF_LARGEST = 1e-9, 1e-12  # diagonal shares added against rounding; source: above float64, 2.2e-16
@@ -171,19 +166,19 @@ class Measurements:
 
     # `station_m`, `left_m`, `sigma_m`, `sign`: shape (M,): markers: station, left offset, standard deviation [m]; 1 on
     # the left boundary, -1 on the right
-    station_m: TypesFloats
-    left_m: TypesFloats
-    sigma_m: TypesFloats
-    sign: TypesFloats
+    station_m: Floats
+    left_m: Floats
+    sigma_m: Floats
+    sign: Floats
     # `fix_station_m`, `fix_left_m`, `fix_sigma_m`: shape (F,): [m] fixes of the vehicle
-    fix_station_m: TypesFloats
-    fix_left_m: TypesFloats
-    fix_sigma_m: TypesFloats
+    fix_station_m: Floats
+    fix_left_m: Floats
+    fix_sigma_m: Floats
     # `pair_station_m`, `pair_slope`, `pair_sigma`: shape (P,): slope of the centre against the line, from pairs of
     # markers
-    pair_station_m: TypesFloats
-    pair_slope: TypesFloats
-    pair_sigma: TypesFloats
+    pair_station_m: Floats
+    pair_slope: Floats
+    pair_sigma: Floats
     known_lengths: KnownLengths = NO_KNOWN_LENGTHS
 
 
@@ -203,10 +198,10 @@ class LaneProblem:
         self.knot_m = (end_m - start_m) / (self.count - 1)
         self.start_m = start_m
         self.size = self.fields * self.count
-        self.station_m: TypesFloats = start_m + self.knot_m * np.arange(self.count, dtype=np.float64)
+        self.station_m: Floats = start_m + self.knot_m * np.arange(self.count, dtype=np.float64)
         self.measured = measured
-        self.data: TypesFloats = np.zeros((_BAND + 1, self.size))
-        self.right: TypesFloats = np.zeros(self.size)
+        self.data: Floats = np.zeros((_BAND + 1, self.size))
+        self.right: Floats = np.zeros(self.size)
         self.energy = 0.0
         self.marker_index, self.marker_value = self._rows(measured.station_m, [1.0, None], measured.sign / 2)
         self._add(self.marker_index, self.marker_value, measured.sigma_m, measured.left_m)
@@ -217,9 +212,7 @@ class LaneProblem:
         if self.fields == 3 and not self.tracked:
             self._add_known_lengths(line)
 
-    def _rows(
-        self, station_m: TypesFloats, parts: list[float | None], varying: TypesFloats | None = None
-    ) -> tuple[TypesInts, TypesFloats]:
+    def _rows(self, station_m: Floats, parts: list[float | None], varying: Floats | None = None) -> tuple[Ints, Floats]:
         """Sparse rows for a linear combination of the fields at stations.
 
         Parameters
@@ -239,7 +232,7 @@ class LaneProblem:
             value += [scale * (1 - share), scale * share]
         return np.stack(index, 1), np.stack(value, 1)
 
-    def _add(self, index: TypesInts, value: TypesFloats, sigma: TypesFloats, target: TypesFloats) -> None:
+    def _add(self, index: Ints, value: Floats, sigma: Floats, target: Floats) -> None:
         """Add measurements to the normal equations."""
         weight = sigma**-2.0
         self.data += gram(index, value, weight, self.size, _BAND)
@@ -257,7 +250,7 @@ class LaneProblem:
         index, value = self.slope_rows(self.measured.pair_station_m)
         self._add(index, value, self.measured.pair_sigma, self.measured.pair_slope)
 
-    def slope_rows(self, station_m: TypesFloats) -> tuple[TypesInts, TypesFloats]:
+    def slope_rows(self, station_m: Floats) -> tuple[Ints, Floats]:
         """Sparse rows for the slope of c at stations."""
         place = (station_m - self.start_m) / self.knot_m
         knot = np.clip(place.astype(np.int64), 0, self.count - 2)
@@ -311,14 +304,14 @@ class LaneProblem:
         self.right[3 * ends + 2] += weight * e.excess_m[apart]
         self.energy += float(np.sum(weight * e.excess_m[apart] ** 2))
 
-    def _squared_derivative(self, order: int, field: int) -> TypesFloats:
+    def _squared_derivative(self, order: int, field: int) -> Floats:
         """Integral of the squared derivative of a field."""
         own = difference_gram(order, self.count, order)
         spread = np.zeros((_BAND + 1, self.size))
         spread[: self.fields * order + 1 : self.fields, field :: self.fields] = own
         return spread * self.knot_m ** (1 - 2 * order)
 
-    def matrix(self, s: Hyperparameters) -> tuple[TypesFloats, TypesFloats, float]:
+    def matrix(self, s: Hyperparameters) -> tuple[Floats, Floats, float]:
         """Normal matrix, right-hand side, and the sum of squares at zero."""
         width = _width_weights(s)
         total = self.data + self.bend / s.bend**2
@@ -360,22 +353,22 @@ class LaneProblem:
 class LaneSolution:
     """A solved problem."""
 
-    def __init__(self, problem: LaneProblem, cholesky: TypesFloats, x: TypesFloats) -> None:
+    def __init__(self, problem: LaneProblem, cholesky: Floats, x: Floats) -> None:
         self.problem, self._cholesky, self._x = problem, cholesky, x
         self.centre_m = x[:: problem.fields]
         self.width_m = x[1 :: problem.fields]
 
     @cached_property
-    def _inverse(self) -> TypesFloats:
+    def _inverse(self) -> Floats:
         """Covariance of unknowns that are near each other."""
         return np.asarray(inverse_band(self._cholesky))
 
-    def residuals(self) -> TypesFloats:
+    def residuals(self) -> Floats:
         """Distance of each marker left of its boundary. [m]"""
         p = self.problem
         return p.measured.left_m - apply(p.marker_index, p.marker_value, self._x)
 
-    def residual_variance_shares(self) -> TypesFloats:
+    def residual_variance_shares(self) -> Floats:
         """1 - h of each marker, where its leverage h is the share of its own measurement in the prediction.
 
         Against the prediction of the other markers alone its residual is r / (1 - h), with the standard deviation
@@ -385,13 +378,13 @@ class LaneSolution:
         variance = variances(self._inverse, p.marker_index, p.marker_value)
         return np.maximum(1 - variance / p.measured.sigma_m**2, _MIN_VARIANCE_SHARE)
 
-    def slopes(self, station_m: TypesFloats) -> tuple[TypesFloats, TypesFloats]:
+    def slopes(self, station_m: Floats) -> tuple[Floats, Floats]:
         """Slope of the centre against the line at stations, and its standard deviation."""
         index, value = self.problem.slope_rows(station_m)
         variance = variances(self._inverse, index, value)
         return apply(index, value, self._x), np.sqrt(np.maximum(variance, 0.0))
 
-    def sigmas(self) -> tuple[TypesFloats, TypesFloats, TypesFloats, TypesFloats, TypesFloats]:
+    def sigmas(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """The knots, and standard deviations there of the centre, left boundary, right boundary and width. [m]"""
         p, inverse = self.problem, self._inverse
         cc, cw, ww = inverse[0, :: p.fields], inverse[1, :: p.fields], inverse[0, 1 :: p.fields]

@@ -8,19 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from app.lanes.smooth_line import SmoothLine, median_place, plane_from_wgs84
-from app.lanes.types import (
-    LEFT,
-    RIGHT,
-    UNKNOWN,
-    Bools,
-    Floats,
-    Ints,
-    LaneMarkers,
-    LaneRules,
-    LeftOut,
-    LeftOutReason,
-    Notes,
-)
+from app.lanes.types import LEFT, RIGHT, UNKNOWN, LaneMarkers, LaneRules, LeftOut, LeftOutReason, Notes
+from app.values import Bools, Floats, Ints
 
 _USUAL_SIGMA_M = 0.02  # [m] source: the survey of the CERPM paper, section 2.2
 _MIN_SIGMA_M = 0.005  # [m] source: half the 1.1 cm steps of a message's degrees (`markers.cerpm.DEGREE_STEP`)

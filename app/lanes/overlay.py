@@ -26,9 +26,7 @@ from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
 from app.sensors.camera import Camera
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+from app.values import Bools, Floats
 
 NEAR_M = 0.2  # [m] nearest distance along the camera's axis that is drawn
 _LEVEL_FROM_VEHICLE = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])

@@ -9,7 +9,8 @@ import pymap3d
 import scipy
 
 from app.geodesy.frames import WGS84_A_M, metres_per_radian
-from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints
+from app.lanes.types import LEFT, RIGHT, UNKNOWN
+from app.values import Bools, Floats, Ints
 
 # === WGS 84 positions in a local plane, and back.
 

@@ -7,12 +7,12 @@ from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from app.errors import InvalidParameter
 from app.inputs import Declaration
 from app.markers.cerpm import LaneSide
+from app.values import Floats, Ints
 
 # === The planned place of a marker on a boundary of a lane.
 
@@ -30,9 +30,6 @@ class MarkerPlace:
 # === Inputs and results of estimating a lane.
 
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 MAX_TRACK_SIGNIFICANCE = 4.5  # standard deviations above which path and track disagree; 1 in 150,000
 MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; a lane leaves as much room
 UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, LaneSide.RIGHT))

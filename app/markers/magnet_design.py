@@ -32,6 +32,7 @@ from app.markers.magnet import (
     segments_in,
     ticks_from_m,
 )
+from app.values import Floats
 
 
 @with_config(INPUT)
@@ -179,7 +180,6 @@ def _compositions(total: int, parts: int, least: int) -> Iterator[tuple[int, ...
 # gaps does not.
 
 
-FloatArray = npt.NDArray[np.float64]
 MAX_PLACEMENTS = 4000
 """Placements that are examined at most; of larger designs, so many at equal ranks. Chosen for speed
 (docs/decisions/0013-magnet-tags.md has the times)."""
@@ -247,7 +247,7 @@ class OdometerError:
     def __post_init__(self) -> None:
         _check_fields(self, may_be_zero=("quantum_m_s", "drift"))
 
-    def gap_std_m(self, gaps_m: FloatArray, speed_m_s: float) -> FloatArray:
+    def gap_std_m(self, gaps_m: Floats, speed_m_s: float) -> Floats:
         """Standard deviation of the length of gaps, same shape. [m]"""
         quantised = self.quantum_m_s / math.sqrt(12) * np.sqrt(gaps_m / speed_m_s / self.rate_hz)
         return np.hypot(quantised, self.drift * gaps_m)
@@ -276,7 +276,7 @@ class ReadingConditions:
                 )
 
 
-def covariance_of(gaps_m: FloatArray, conditions: ReadingConditions) -> FloatArray:
+def covariance_of(gaps_m: Floats, conditions: ReadingConditions) -> Floats:
     """Covariance of u, the middle magnets' places over the tag's length, as they are read.
 
     Parameters
@@ -297,7 +297,7 @@ def covariance_of(gaps_m: FloatArray, conditions: ReadingConditions) -> FloatArr
     length = gaps_m.sum(axis=1)[:, None, None]
     u = np.cumsum(gaps_m, axis=1)[:, :-1] / length[:, :, 0]
     slope = (np.tril(np.ones((count - 1, count))) - u[:, :, None]) / length
-    covariance: FloatArray = slope @ of_gaps @ slope.transpose(0, 2, 1)
+    covariance: Floats = slope @ of_gaps @ slope.transpose(0, 2, 1)
     return covariance
 
 
@@ -315,7 +315,7 @@ def ratio_std(gaps_m: Sequence[float], conditions: ReadingConditions) -> tuple[f
     return tuple(stds)
 
 
-def separation(u: FloatArray, covariance: FloatArray, others_u: FloatArray) -> FloatArray:
+def separation(u: Floats, covariance: Floats, others_u: Floats) -> Floats:
     """Distance from one code to others in standard deviations of reading it.
 
     Parameters
@@ -333,7 +333,7 @@ def separation(u: FloatArray, covariance: FloatArray, others_u: FloatArray) -> F
     if not len(u):
         return np.zeros(len(others_u))
     delta = others_u - u
-    distance: FloatArray = np.sqrt(np.sum(delta * np.linalg.solve(covariance, delta.T).T, axis=1))
+    distance: Floats = np.sqrt(np.sum(delta * np.linalg.solve(covariance, delta.T).T, axis=1))
     return distance
 
 
@@ -403,7 +403,7 @@ def placements_of(design: TagDesign, max_count: int = MAX_PLACEMENTS) -> npt.NDA
     return np.array(rows, dtype=np.int64).reshape(-1, design.magnets - 1)
 
 
-def _confusion(design: TagDesign, steps: npt.NDArray[np.int64], conditions: ReadingConditions) -> FloatArray:
+def _confusion(design: TagDesign, steps: npt.NDArray[np.int64], conditions: ReadingConditions) -> Floats:
     """Sum of the probabilities that each placement is taken for one of its neighbours on the grid, shape (K,)."""
     middles = design.magnets - 2
     total = np.zeros(len(steps))

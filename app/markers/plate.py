@@ -28,6 +28,7 @@ import reedsolo
 
 from app.errors import CodeMismatch, InvalidParameter
 from app.geodesy import check_lon_lat
+from app.values import Floats
 
 # === Reed-Solomon words over GF(16) on the cells of a plate.
 #
@@ -564,7 +565,6 @@ def decimal_codes(symbols: Sequence[int], n: int = 8) -> tuple[PlateCode, ...]:
 
 
 Digits = npt.NDArray[np.bytes_]
-_Floats = npt.NDArray[np.float64]
 _Numbers = npt.NDArray[np.uint64]
 _Symbols = npt.NDArray[np.uint8]
 _NEAR_TIE = 0.02
@@ -572,8 +572,8 @@ _ASCII = np.frombuffer(b"0123456789ABCDEF", dtype=np.uint8)
 
 
 def position_digits(
-    lon_deg: _Floats,
-    lat_deg: _Floats,
+    lon_deg: Floats,
+    lat_deg: Floats,
     *,
     n: int = 8,
     scheme: PlateScheme = PlateScheme.POSITION,
@@ -603,7 +603,7 @@ def position_digits(
     return digits
 
 
-def _decimals_of_many(degrees: _Floats, places: int) -> tuple[_Numbers, npt.NDArray[np.bool_]]:
+def _decimals_of_many(degrees: Floats, places: int) -> tuple[_Numbers, npt.NDArray[np.bool_]]:
     """Decimals of |degrees| as numbers, and which of them need exact arithmetic."""
     scaled = np.abs(degrees) * 10.0**places
     decimals = np.rint(scaled).astype(np.uint64) % np.uint64(10**places)

@@ -15,8 +15,8 @@ from pydantic import Field
 
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 LETTERS = "FDCBA"
 """Letters of the grades 0 to 4. Source: ISO/IEC 15415, as ANSI X3.182 writes them."""
 

@@ -18,6 +18,7 @@ from app.formats.surveys.declaration import METRES, Unit
 from app.geodesy import LocalizationGrade, check_lon_lat, grade_accuracy
 from app.geodesy.systems import VerticalDatum
 from app.inputs import INPUT, Flag, Number, Text
+from app.values import Floats
 
 # === What is declared of a file with a road, as for surveys: CRS, realization, epoch, heights, units, or an origin.
 
@@ -97,8 +98,6 @@ class AlignmentDeclaration:
 
 # === The road that a plan is made for.
 
-
-Floats = npt.NDArray[np.float64]
 
 STEP_M = 1.0
 """Greatest distance between samples of a lane. [m] The sagitta at 20 m radius is 6 mm."""

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
@@ -27,8 +26,7 @@ from app.planning.road.lanes import (
 )
 from app.planning.road.reference import PlacedRoad, RoadReference, find_reference
 from app.planning.rules import RoadRules
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 MIN_LANE_M = 5.0
 """Shorter lanes get no markers. [m] Source: issue 13; a plate's spacing is at least 5 m."""

@@ -11,8 +11,7 @@ from app.errors import InvalidParameter
 from app.lanes.cross_sections import CrossSections, cut_lane
 from app.lanes.types import MarkerPlace
 from app.markers.cerpm import LaneSide
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 SPACING_M = 12.192  # [m] 40 ft; source: the cycle N of a broken line, MUTCD 2009 section 3B.11, and the CERPM paper
 MIN_SPACING_M = 1.0  # [m]

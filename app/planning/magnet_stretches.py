@@ -8,9 +8,10 @@ from itertools import groupby
 import numpy as np
 from pyproj import Geod
 
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.plan import PlannedLineMagnet, PlannedMarker
 from app.roads.lane_line import LaneLine
+from app.values import Floats
 
 _EVEN_M = 0.005  # [m] difference of neighbouring distances in one line; source: a drill's tolerance, METRO section 8.2
 _MAX_LINE_M = 19_000.0  # [m] source: below `app.roads.lane_line.MAX_LENGTH_M`

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from app.markers.plate import PlateGeometry
-from app.planning.alignment import Floats
 from app.planning.rules import CameraRules
 from app.sensors.camera import Camera
+from app.values import Floats
 
 
 def camera_of(rules: CameraRules) -> Camera:

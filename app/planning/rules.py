@@ -41,6 +41,7 @@ from app.markers.magnet_design import TagDesign
 from app.markers.plate import RECOMMENDED_SCHEME, PlateGeometry, PlateScheme, recommended_geometry
 from app.planning.magnet_checks import vehicle_clearances
 from app.radio.settings import RadioSettings, Region
+from app.values import JsonObject
 
 # === Marking cycles per country and edition, as data with citations: app/planning/data/marking_rules.json.
 
@@ -385,7 +386,7 @@ _DatesAsTexts.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.con
 
 
 @cache
-def rules_schema() -> dict[str, Any]:
+def rules_schema() -> JsonObject:
     """JSON Schema (draft 2020-12) of a document of rules; not to be changed."""
     return {"$schema": _DIALECT, "$id": SCHEMA_ID, **PlanRules.model_json_schema()}
 
@@ -559,11 +560,11 @@ def _names(names: list[str]) -> str:
     return ", ".join(names[:_LONG_LIST]) + (", ..." if len(names) > _LONG_LIST else "")
 
 
-def _schema_at(path: list[str | int]) -> dict[str, Any]:
+def _schema_at(path: list[str | int]) -> JsonObject:
     """The part of the JSON Schema that describes the value at a path; empty where there is none."""
     schema = rules_schema()
     definitions = schema["$defs"]
-    here: dict[str, Any] = schema
+    here: JsonObject = schema
     for part in [*path, None]:
         for option in (here, *here.get("anyOf", ())):
             if "$ref" in option:

@@ -13,7 +13,7 @@ from html import escape
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 INK, GREY, FRAME, GRID = "#1c1f23", "#555", "#bbb", "#eee"
 """Colours of strong text, of labels and ticks, of a panel's border, of lines across a panel."""

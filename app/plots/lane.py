@@ -37,11 +37,10 @@ from app.plots.axes import (
     ticks,
 )
 from app.sensors.pose_track import PoseTrack
+from app.values import Floats, Ints
 
 # === The strength of packets over distance, with the fitted path loss, as a panel of an SVG.
 
-
-Floats = npt.NDArray[np.float64]
 
 PANEL_HEIGHT = 170
 _MAX_DOTS = 1500  # packets that are drawn
@@ -101,8 +100,6 @@ def _fitted(signals: SignalPicture, panel: Panel, along: Scale, up: Scale) -> li
 
 # === A picture of a decoded lane, as SVG.
 
-
-Ints = npt.NDArray[np.int64]
 
 _LONG_M = 3000.0  # [m] longer tracks are not dashed: dashes of a zigzag cannot be seen
 _WIDTH, _LEFT, _RIGHT = 1200, 80, 1138  # [px] of the picture, and the sides of its panels

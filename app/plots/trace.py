@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from app.decoders.magnet.readings import Finding, LineCrossing, MagnetReading, NoiseFinding, TagReading
@@ -31,8 +30,7 @@ from app.plots.axes import (
     ticks,
 )
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 _WIDTH, _HEIGHT = 1200, 470
 _FIELD, _BAR = Panel(62, 1180, 74, 246), Panel(62, 1180, 284, 422)

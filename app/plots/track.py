@@ -35,8 +35,7 @@ from app.plots.axes import (
 from app.surveys.comparison import Comparison
 from app.surveys.georeference import GeoreferencedSurvey
 from app.tracks.types import Track
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 _WIDTH, _HEIGHT = 1200, 760
 _MAP, _SIGMA = Panel(62, 1180, 44, 540), Panel(62, 1180, 590, 720)

@@ -13,8 +13,7 @@ from pydantic import Field
 
 from app.inputs import Number
 from app.radio.settings import check_between, check_modulation
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 NEAR_M, NEAR_DBM = 50.0, -108.0  # [m, dBm] source: CERPM paper, section 4.1
 FAR_M, FAR_DBM = 340.0, -125.0  # [m, dBm] source: CERPM paper, section 4.1

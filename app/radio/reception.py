@@ -14,11 +14,10 @@ from app.errors import InvalidParameter
 from app.inputs import Flag, Number, Whole
 from app.radio.link import LinkModel, sensitivity_dbm
 from app.radio.settings import MAX_CHANNELS, RadioSettings, check_between, check_whole
+from app.values import Floats
 
 # === Share of packets that are received where many markers share the channel: pure ALOHA with capture.
 
-
-Floats = npt.NDArray[np.float64]
 
 CAPTURE_DB = 6.0  # [dB] a packet survives others this much weaker; source: Bor et al., MSWiM 2016, "Do LoRa low-power
 # wide-area networks scale?"

@@ -20,6 +20,7 @@ import sqlalchemy as sa
 
 from app.registry.engines import seeing_every_agency
 from app.registry.spatial import fill_rtree
+from app.values import JsonObject
 
 # === Many rows by column: shared values are stored once, and the JSON of each row is made from one template.
 
@@ -33,7 +34,7 @@ class Columns:
     """Rows that have the same columns."""
 
     count: int  # rows
-    same: dict[str, Any]  # columns in which all rows agree: name to value
+    same: JsonObject  # columns in which all rows agree: name to value
     own: dict[str, Sequence[object]]  # the others: name to `count` values; of JSON columns either values or `JsonTexts`
 
     @classmethod
@@ -58,7 +59,7 @@ class Columns:
         """A column as a list."""
         return list(self.own[name]) if name in self.own else [self.same[name]] * self.count
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[JsonObject]:
         """The rows one by one."""
         lists = [
             [orjson.loads(text) for text in values] if isinstance(values, JsonTexts) else values

@@ -20,6 +20,7 @@ from sqlalchemy.sql.functions import FunctionElement
 
 from app.geodesy import LocalizationGrade, grade_accuracy, total_accuracy_m
 from app.geodesy.place import stored_frame
+from app.values import JsonObject
 
 # === Columns of a marker's grade, also for rows and versions from before there were grades.
 
@@ -29,7 +30,7 @@ NO_RMSE = "no horizontal accuracy is stated: state horizontal_rmse_m"
 """Cure of a position that is unfit for localization for lack of it."""
 
 
-def grade_columns(horizontal_rmse_m: float | None, accuracy_m: float | None, note: str | None) -> dict[str, Any]:
+def grade_columns(horizontal_rmse_m: float | None, accuracy_m: float | None, note: str | None) -> JsonObject:
     """Columns of a position's grade: by its survey, and by the accuracy of its frame with the note on it."""
     notes = [text for text in (NO_RMSE if horizontal_rmse_m is None else None, note) if text]
     return {

@@ -16,6 +16,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from app.errors import NotFound
 from app.registry.column_types import ID, UtcTime, agency_column, fetch_all, find_one, metadata, select_rows
 from app.registry.jobs import JobState, jobs
+from app.values import JsonObject
 
 # an upload that is decoded; one that is not decoded while its sender waits has a job of the same id
 decodes = sa.Table(
@@ -60,13 +61,13 @@ class DecodeRow(NamedTuple):
 
     id: str
     kind: str  # of the upload: frame, archive, trace or packets
-    context: dict[str, Any]  # what was declared of the upload
+    context: JsonObject  # what was declared of the upload
     created_at: datetime
     finished_at: datetime | None = None
     # `upload_key`, `picture_key`: keys of the blobs of the upload and of the plot
     upload_key: str | None = None
     picture_key: str | None = None
-    result: dict[str, Any] | None = None  # None until the decode is done
+    result: JsonObject | None = None  # None until the decode is done
     state: JobState = "queued"
     progress: float = 0.0
     attempts: int = 0
@@ -93,7 +94,7 @@ class NewObservation(NamedTuple):
     frame: int  # index of the frame in an archive; 0 for every other upload
     at: datetime
     what: str  # ``seen``, or what was wrong
-    detail: dict[str, Any]
+    detail: JsonObject
 
 
 _JOB_COLUMNS: dict[str, sa.ColumnElement[object]] = {
@@ -203,7 +204,7 @@ class ObservationRow(NamedTuple):
     frame: int
     at: datetime
     what: str
-    detail: dict[str, Any] | None
+    detail: JsonObject | None
 
 
 class KindCount(NamedTuple):

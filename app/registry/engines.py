@@ -16,6 +16,7 @@ from sqlalchemy import event
 
 from app.errors import ClientLeft, CommitUnknown, StorageFull, Unavailable
 from app.registry.spatial import register_functions
+from app.values import JsonObject
 
 # === The agency of a transaction, for row level security on PostgreSQL (migration 0009).
 #
@@ -275,7 +276,7 @@ def postgres_asking_engine(url: sa.URL) -> sa.Engine:
     return engine
 
 
-def _connect_args(url: sa.URL) -> dict[str, Any]:
+def _connect_args(url: sa.URL) -> JsonObject:
     given = url.query.get("options", "")
     options = [f"-c {name}={value}" for name, value in _SESSION.items()]
     return {

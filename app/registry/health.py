@@ -28,6 +28,7 @@ from app.registry.decodes import NewObservation, decodes, observations
 from app.registry.features import FeatureTable, Field
 from app.registry.spatial import Box, within_box
 from app.registry.vehicles import vehicle_uploads
+from app.values import JsonObject
 
 ITEM_STATUSES = ("open", "approved", "rejected")
 
@@ -124,7 +125,7 @@ class HealthRow(NamedTuple):
     last_at: datetime
     ratios: dict[str, float]
     quality: float | None
-    state: dict[str, Any]
+    state: JsonObject
     updated_at: datetime
 
 
@@ -294,7 +295,7 @@ class ItemRow(NamedTuple):
     passes: int
     first_at: datetime
     last_at: datetime
-    evidence: dict[str, Any]  # JSON: limits, displacement, uploads, damage reports
+    evidence: JsonObject  # JSON: limits, displacement, uploads, damage reports
     note: str | None
     decided_by: str | None
     decided_at: datetime | None

@@ -24,6 +24,7 @@ from app.registry.column_types import (
     select_rows,
 )
 from app.registry.webhooks import add_event, events
+from app.values import JsonObject
 
 # work that outlives the request that asked for it; what is true of a job is true in its row, and nowhere else
 UNFINISHED_JOBS = sa.text("state IN ('queued', 'running')")
@@ -110,10 +111,10 @@ class JobRow(NamedTuple):
     attempts: int
     progress: float  # from 0 to 1
     cancel_requested: bool
-    input: dict[str, Any]  # what the job needs to know besides its upload
+    input: JsonObject  # what the job needs to know besides its upload
     upload_key: str | None  # key of the blob that the job reads
     # `result`, `error`: what the job returned, or why it failed
-    result: dict[str, Any] | None
+    result: JsonObject | None
     error: dict[str, str] | None
     created_at: datetime
     finished_at: datetime | None

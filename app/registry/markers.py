@@ -42,6 +42,7 @@ from app.registry.spatial import (
     within_box,
     within_radius,
 )
+from app.values import JsonObject
 
 # where the magnets of magnet markers lie: what follows from their layouts, kept for searches
 magnets = sa.Table(
@@ -567,7 +568,7 @@ def list_records(
     *,
     after: str | None,
     limit: int,
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Markers in the order of their ids as flat records of these fields: columns, `code`, and `side` of CERPMs."""
     own = {"code": markers.c.digits, "side": markers.c.spec["side"].as_string()}
     columns = [own[name].label(name) if name in own else markers.c[name] for name in fields]

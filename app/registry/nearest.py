@@ -15,14 +15,14 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import sqlalchemy as sa
 
 from app.registry.column_types import row_maker
 from app.registry.features import in_box
 from app.registry.marker_rows import PUBLIC, MarkerRow, markers
 from app.registry.markers import MarkerFilter, conditions_of
-from app.registry.spatial import Box, FloatArray, box_around, distances_m, within_box
+from app.registry.spatial import Box, box_around, distances_m, within_box
+from app.values import Floats, Ints, JsonObject
 
 # === Places of markers in many circles.
 
@@ -55,7 +55,6 @@ def list_places(
 
 
 Found = list[tuple[MarkerRow, float]]
-_Rows = npt.NDArray[np.int64]
 
 AT_ONCE = 30
 _FIRST_M = 250.0
@@ -152,7 +151,7 @@ class _Search:
         self._connection, self._agency_id, self._narrowed = connection, agency_id, filtered
         self._lon, self._lat = lon_deg, lat_deg
 
-    def by_order(self, count: int, max_m: float) -> tuple[_Rows, FloatArray]:
+    def by_order(self, count: int, max_m: float) -> tuple[Ints, Floats]:
         """Rows and distances inside a radius that the order of the index bounds."""
         values = {"lon": self._lon, "lat": self._lat, "most": count}
         rows, distances = self._measured(_in_order(self._narrowed, False), values)
@@ -160,7 +159,7 @@ class _Search:
             return rows[distances <= max_m], distances[distances <= max_m]
         return self._circle(min(float(distances.max()), max_m))
 
-    def by_radius(self, count: int, max_m: float) -> tuple[_Rows, FloatArray]:
+    def by_radius(self, count: int, max_m: float) -> tuple[Ints, Floats]:
         """Rows and distances inside a radius that grows until it holds enough, and shrinks where it holds too many."""
         radius_m, limit, counted = min(_FIRST_M, max_m), _MANY + 4 * count, False
         while True:
@@ -189,7 +188,7 @@ class _Search:
             found.update({row[0]: _make(row[1:]) for row in self._connection.execute(query)})
         return found
 
-    def _circle(self, radius_m: float, limit: int = _ALL) -> tuple[_Rows, FloatArray]:
+    def _circle(self, radius_m: float, limit: int = _ALL) -> tuple[Ints, Floats]:
         parts = box_around(self._lon, self._lat, radius_m).parts
         statement = _inside(self._narrowed, _wide(parts), False)
         rows, distances = self._measured(statement, {**_sides(parts), "most": limit})
@@ -198,7 +197,7 @@ class _Search:
         near = distances <= radius_m
         return rows[near], distances[near]
 
-    def _measured(self, statement: sa.Select[Any], values: dict[str, Any]) -> tuple[_Rows, FloatArray]:
+    def _measured(self, statement: sa.Select[Any], values: JsonObject) -> tuple[Ints, Floats]:
         found = self._connection.execute(statement, {**values, "agency": self._agency_id}).all()
         places = np.array([tuple(row) for row in found], dtype=np.float64).reshape(-1, 3)
         return places[:, 0].astype(np.int64), distances_m(self._lon, self._lat, places[:, 1], places[:, 2])

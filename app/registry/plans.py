@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import sqlalchemy as sa
 
@@ -16,6 +16,7 @@ from app.registry.markers import MarkerFilter, conditions_of
 from app.registry.plan_states import plan_markers, plans
 from app.registry.resources import Resource
 from app.registry.spatial import Box, within_box
+from app.values import JsonObject
 
 alignments = sa.Table(
     "alignments",
@@ -88,8 +89,8 @@ class AlignmentRow(NamedTuple):
     name: str
     source_key: str
     source_sha256: str
-    declaration: dict[str, Any]
-    summary: dict[str, Any]
+    declaration: JsonObject
+    summary: JsonObject
     version: int
     created_at: datetime
     updated_at: datetime
@@ -104,8 +105,8 @@ class PlanRow(NamedTuple):
     status: str
     rules: dict[str, object]
     document_key: str
-    summary: dict[str, Any]
-    proof: dict[str, Any] | None
+    summary: JsonObject
+    proof: JsonObject | None
     author: str
     author_id: str
     approver: str | None

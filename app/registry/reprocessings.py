@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import sqlalchemy as sa
 
@@ -13,6 +13,7 @@ from app.registry.decodes import decodes
 from app.registry.jobs import JobKind, jobs, request_cancel
 from app.registry.resources import Resource
 from app.registry.vehicles import vehicle_uploads
+from app.values import JsonObject
 
 reprocessings = sa.Table(
     "reprocessings",
@@ -70,7 +71,7 @@ class ReprocessingRow(NamedTuple):
     id: str
     agency_id: str
     who: str
-    criteria: dict[str, Any]
+    criteria: JsonObject
     decodes: int
     created_at: datetime
     approved_at: datetime | None = None
@@ -109,7 +110,7 @@ class VersionRow(NamedTuple):
     decode_id: str
     reprocessing_id: str
     decoder: str | None
-    result: dict[str, Any]
+    result: JsonObject
     finished_at: datetime | None
     replaced_at: datetime
 

@@ -24,6 +24,7 @@ from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
 from app.registry.marker_rows import markers
+from app.values import Floats, Floats32, Ints
 
 # === Fills an empty R*Tree of SQLite in one pass: points are sorted into full nodes instead of inserted one by one.
 #
@@ -38,9 +39,6 @@ _CELL = np.dtype([("id", ">i8"), ("box", ">f4", (4,))])
 _HEADER = np.dtype([("depth", ">u2"), ("cells", ">u2")])
 _ROOT = 1
 _PART = 20_000  # rows read or written at a time
-
-Ids = npt.NDArray[np.int64]
-Boxes = npt.NDArray[np.float32]
 
 
 def fill_rtree(connection: sa.Connection, table: str) -> None:
@@ -64,7 +62,7 @@ def fill_rtree(connection: sa.Connection, table: str) -> None:
     _store(connection, rtree, ids, boxes, root, np.zeros(1, dtype=np.intp), size=size, is_leaf=depth == 0, depth=depth)
 
 
-def _read_boxes(connection: sa.Connection, table: str) -> tuple[Ids, Boxes]:
+def _read_boxes(connection: sa.Connection, table: str) -> tuple[Ints, Floats32]:
     """Rows, shape (N,), and the boxes of their positions, shape (N, 4)."""
     driver = connection.connection.driver_connection
     assert driver is not None
@@ -77,7 +75,7 @@ def _read_boxes(connection: sa.Connection, table: str) -> tuple[Ids, Boxes]:
     return np.concatenate(ids), np.concatenate(boxes)
 
 
-def _outward(positions: npt.NDArray[np.float64]) -> Boxes:
+def _outward(positions: npt.NDArray[np.float64]) -> Floats32:
     """Boxes of points, shape (N, 4): each side the next 32-bit float that is not inside."""
     near = positions.astype(np.float32)
     low = np.where(near > positions, np.nextafter(near, np.float32(-np.inf)), near)
@@ -85,7 +83,7 @@ def _outward(positions: npt.NDArray[np.float64]) -> Boxes:
     return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=1).astype(np.float32)
 
 
-def _packed(boxes: Boxes, max_cells: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _packed(boxes: Floats32, max_cells: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Order of the entries and the first of each node: slices of longitude, in each runs of latitude."""
     nodes = math.ceil(len(boxes) / max_cells)
     slices = math.ceil(math.sqrt(nodes))
@@ -108,9 +106,9 @@ def _edges(number: npt.NDArray[np.int32]) -> tuple[list[int], list[int]]:
 def _store(
     connection: sa.Connection,
     rtree: str,
-    ids: Ids,
-    boxes: Boxes,
-    nodes: Ids,
+    ids: Ints,
+    boxes: Floats32,
+    nodes: Ints,
     starts: npt.NDArray[np.intp],
     *,
     size: int,
@@ -145,7 +143,6 @@ def _node(cells: npt.NDArray[np.void], depth: int, size: int) -> bytes:
 # === Where markers are.
 
 
-FloatArray = npt.NDArray[np.float64]
 _CONTINENT_DEG2 = 2_500.0
 _M_PER_DEG = 110_574.0  # [m/deg] shortest degree of latitude on WGS 84, at the equator
 
@@ -364,7 +361,7 @@ def distance_to(lon_deg: sa.ColumnElement[float], lat_deg: sa.ColumnElement[floa
     return sa.func.waymark_distance_m(markers.c.lon_deg, markers.c.lat_deg, lon_deg, lat_deg, type_=sa.Double)
 
 
-def distances_m(lon_deg: float, lat_deg: float, lons_deg: FloatArray, lats_deg: FloatArray) -> FloatArray:
+def distances_m(lon_deg: float, lat_deg: float, lons_deg: Floats, lats_deg: Floats) -> Floats:
     """Geodesic distances of positions from one position, shape (N,). [m]"""
     same = np.ones(len(lons_deg))
     return np.asarray(_ellipsoid().inv(lon_deg * same, lat_deg * same, lons_deg, lats_deg)[2], dtype=np.float64)

@@ -17,6 +17,7 @@ import sqlalchemy as sa
 
 from app.registry.features import FeatureTable, in_box
 from app.registry.spatial import Box
+from app.values import Ints
 
 # === Mapbox Vector Tiles 2.1 of points, for databases that cannot write them. Section numbers are those of the
 #
@@ -30,10 +31,9 @@ _MOVE_TO_ONCE = 9  # 4.3.1: command 1, count 1
 _FEATURE, _TAGS, _TYPE, _GEOMETRY = 0x12, 0x12, 0x18, 0x22
 _DOUBLE = struct.Struct("<d").pack
 Value = str | int | float | bool
-Numbers = npt.NDArray[np.int64]
 
 
-def write_layer(name: str, columns: Mapping[str, Sequence[Value | None]], points_px: Numbers) -> bytes:
+def write_layer(name: str, columns: Mapping[str, Sequence[Value | None]], points_px: Ints) -> bytes:
     """A tile with one layer of points.
 
     Parameters
@@ -69,7 +69,7 @@ def _distinct(column: Sequence[Value | None]) -> list[Value]:
     return [value for value in dict.fromkeys(column) if value is not None]
 
 
-def _tags(columns: Iterable[Sequence[Value | None]], distinct: Sequence[Sequence[Value]]) -> Numbers:
+def _tags(columns: Iterable[Sequence[Value | None]], distinct: Sequence[Sequence[Value]]) -> Ints:
     """Key and value of each property of each feature, shape (N, 2 x properties); -1 twice for a missing value."""
     tags, first = [], 0
     for k, (column, values) in enumerate(zip(columns, distinct, strict=True)):
@@ -81,7 +81,7 @@ def _tags(columns: Iterable[Sequence[Value | None]], distinct: Sequence[Sequence
     return np.column_stack(tags)
 
 
-def _features(tags: Numbers, points_px: Numbers) -> bytes:
+def _features(tags: Ints, points_px: Ints) -> bytes:
     """All features; a point's feature consists of varints only."""
     count = len(points_px)
     zigzag = (points_px << 1) ^ (points_px >> 63)  # 4.3.2
@@ -98,7 +98,7 @@ def _features(tags: Numbers, points_px: Numbers) -> bytes:
     return _varints(numbers[numbers >= 0])
 
 
-def _lengths(numbers: Numbers) -> Numbers:
+def _lengths(numbers: Ints) -> Ints:
     """Length of each value as a varint; 0 for a negative value, which is left out. [byte]"""
     lengths = (numbers >= 0).astype(np.int64)
     for bits in range(7, 64, 7):
@@ -109,7 +109,7 @@ def _lengths(numbers: Numbers) -> Numbers:
     return lengths
 
 
-def _varints(numbers: Numbers) -> bytes:
+def _varints(numbers: Ints) -> bytes:
     lengths = _lengths(numbers)
     ends = lengths.cumsum()
     out = np.empty(int(ends[-1]), np.uint8)

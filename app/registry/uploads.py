@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import NotFound
 from app.registry.column_types import ID, UtcTime, agency_column, fetch_all, find_one, metadata, one_of, select_rows
+from app.values import JsonObject
 
 UPLOAD_STATES = ("open", "done", "refused", "expired")
 
@@ -80,7 +81,7 @@ class UploadRow(NamedTuple):
     # `length`, `received`: [byte] of the whole file, and of what is stored durably
     length: int
     received: int
-    declared: dict[str, Any]  # ``file_name``, ``context`` (its members that were stated) and ``vehicle``
+    declared: JsonObject  # ``file_name``, ``context`` (its members that were stated) and ``vehicle``
     created_at: datetime
     expires_at: datetime
     # `lock_id`, `locked_until`: the request that writes, and until when nobody else may

@@ -11,6 +11,7 @@ import sqlalchemy as sa
 from app.registry.agencies import api_keys
 from app.registry.column_types import ID, UtcTime, agency_column, columns_of, metadata, one_of, row_maker
 from app.registry.resources import Resource
+from app.values import JsonObject
 
 VEHICLE_STATUSES = ("active", "retired")
 
@@ -87,7 +88,7 @@ class VehicleRow(NamedTuple):
     name: str
     status: str
     note: str | None
-    profile: dict[str, Any]
+    profile: JsonObject
     version: int
     uploads: int
     driven_m: float

@@ -25,8 +25,8 @@ from pyproj import Geod
 
 from app.errors import InvalidParameter
 from app.geodesy.frames import ecef_from_wgs84
+from app.values import Floats
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
 MAX_VERTICES = 100_000  # bounds the memory of an axis
@@ -88,7 +88,7 @@ class Axis:
         edges = [_edges(np.array([p[:2] for p in part], dtype=np.float64), number) for number, part in enumerate(parts)]
         _check_length(sum(float(lengths_m.sum()) for _, _, lengths_m in edges), max_length_m)
         pieces = []
-        self.vertex_chainages_m: list[FloatArray] = []
+        self.vertex_chainages_m: list[Floats] = []
         chainage_m = 0.0
         for number, part_edges in enumerate(edges):
             made, vertices_m = _pieces(*part_edges)
@@ -118,7 +118,7 @@ class Axis:
         return [(float(v[0]), float(v[-1])) for v in self.vertex_chainages_m]
 
     def locate(
-        self, lon_deg: FloatArray, lat_deg: FloatArray, max_offset_m: float, *, max_feet: int = MAX_FEET
+        self, lon_deg: Floats, lat_deg: Floats, max_offset_m: float, *, max_feet: int = MAX_FEET
     ) -> list[list[Foot]]:
         """Feet of places on the axis, for each place the nearest first; none where it is farther than `max_offset_m`.
 
@@ -153,8 +153,8 @@ class Axis:
         return [_sorted(found, max_offset_m) for found in feet]
 
     def place(
-        self, part: IntArray, chainage_m: FloatArray, offset_m: FloatArray
-    ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+        self, part: IntArray, chainage_m: Floats, offset_m: Floats
+    ) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
         """Positions by chainage and offset.
 
         Parameters
@@ -181,12 +181,12 @@ class Axis:
         lon, lat, _ = _GEOD.fwd(lon, lat, np.asarray(back) + 180.0 - 90.0, offset_m)
         return np.asarray(lon), np.asarray(lat), length + offset_m * (end - start) <= 0
 
-    def heading_deg(self, part: IntArray, chainage_m: FloatArray) -> FloatArray:
+    def heading_deg(self, part: IntArray, chainage_m: Floats) -> Floats:
         """Direction of increasing chainage, clockwise from true north, 0 to 360. [deg]"""
         pieces = np.clip(
             np.searchsorted(self._chainage, chainage_m, side="right") - 1, self._first[part], self._last[part]
         )
-        heading: FloatArray = self._azimuth[pieces] % 360.0
+        heading: Floats = self._azimuth[pieces] % 360.0
         return heading
 
     def list_circles(self, step_m: float) -> Iterator[tuple[float, float, float]]:
@@ -203,7 +203,7 @@ class Axis:
 
     # --- pieces and places --------------------------------------------------------------------------------------------
 
-    def _pairs(self, lon: FloatArray, lat: FloatArray, max_offset_m: float) -> Iterator[tuple[IntArray, IntArray]]:
+    def _pairs(self, lon: Floats, lat: Floats, max_offset_m: float) -> Iterator[tuple[IntArray, IntArray]]:
         """Places and pieces that may belong together, some places at a time; all pieces of a place come together."""
         radius = self._reach + 2 * max_offset_m + 1.0
         places = ecef_from_wgs84(lon, lat)
@@ -219,24 +219,20 @@ class Axis:
                 yield near["i"] + start, near["j"]
             start = end
 
-    def _plane(
-        self, places: IntArray, pieces: IntArray, lon: FloatArray, lat: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _plane(self, places: IntArray, pieces: IntArray, lon: Floats, lat: Floats) -> tuple[Floats, Floats, Floats]:
         """Coordinates along and left of pieces, good to a tenth of a millimetre within a kilometre, and shares."""
         away = ecef_from_wgs84(lon, lat)[places] - self._start_ecef[pieces]
         x = np.einsum("ij,ij->i", away, self._forward[pieces])
         y = np.einsum("ij,ij->i", away, self._left[pieces])
         return x, y, self._share(pieces, x, y)
 
-    def _share(self, pieces: IntArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    def _share(self, pieces: IntArray, x: Floats, y: Floats) -> Floats:
         """How far along a piece, 0 to 1 inside its strip; NaN where the strip is folded."""
         start, end = self._shear_start[pieces], self._shear_end[pieces]
         width = self._length[pieces] + y * (end - start)
         return np.where(width > 0, (x - y * start) / np.where(width > 0, width, 1.0), np.nan)
 
-    def _exact(
-        self, places: IntArray, pieces: IntArray, lon: FloatArray, lat: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _exact(self, places: IntArray, pieces: IntArray, lon: Floats, lat: Floats) -> tuple[Floats, Floats]:
         """Along and left of the geodesics of pieces, to the nanometre: the foot is moved until it is square."""
         lon_p, lat_p = lon[places], lat[places]
         lon_a, lat_a, azimuth = self._lon[pieces], self._lat[pieces], self._azimuth[pieces]
@@ -250,9 +246,7 @@ class Axis:
             x, y = x + far * np.cos(angle), -far * np.sin(angle)
         return x, y
 
-    def _add_strips(
-        self, feet: list[list[Foot]], places: IntArray, pieces: IntArray, lon: FloatArray, lat: FloatArray
-    ) -> None:
+    def _add_strips(self, feet: list[list[Foot]], places: IntArray, pieces: IntArray, lon: Floats, lat: Floats) -> None:
         if not len(places):
             return
         x, y = self._exact(places, pieces, lon, lat)
@@ -268,9 +262,9 @@ class Axis:
         feet: list[list[Foot]],
         places: IntArray,
         pieces: IntArray,
-        away: FloatArray,
-        lon: FloatArray,
-        lat: FloatArray,
+        away: Floats,
+        lon: Floats,
+        lat: Floats,
     ) -> None:
         """The nearest place on the axis if it is nearer than the strips give: at ends, corners and tight bends."""
         order = np.lexsort((away, places))
@@ -291,7 +285,7 @@ class Axis:
             feet[place].append(Foot(int(self._part[pieces[k]]), chainage, float(offset[k]), float(beyond[k]), False))
 
 
-def _is_among_nearest(places: IntArray, distance_m: FloatArray, count: int) -> npt.NDArray[np.bool_]:
+def _is_among_nearest(places: IntArray, distance_m: Floats, count: int) -> npt.NDArray[np.bool_]:
     """Which of these candidates are among the `count` nearest ones of their place, shape (N,)."""
     order = np.lexsort((distance_m, places))
     ordered = places[order]
@@ -343,7 +337,7 @@ def _check_count(parts: Sequence[Sequence[Sequence[float]]]) -> None:
         )
 
 
-def _edges(points: FloatArray, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _edges(points: Floats, number: int) -> tuple[Floats, Floats, Floats]:
     """Vertices of a part, and azimuth [deg] and length [m] of the edge from each to the next."""
     if len(points) > 1:
         azimuth, _, length = _GEOD.inv(points[:-1, 0], points[:-1, 1], points[1:, 0], points[1:, 1])
@@ -367,9 +361,7 @@ def _edges(points: FloatArray, number: int) -> tuple[FloatArray, FloatArray, Flo
     return points, azimuth, length
 
 
-def _pieces(
-    points: FloatArray, azimuth: FloatArray, length: FloatArray
-) -> tuple[dict[str, npt.NDArray[np.float64]], FloatArray]:
+def _pieces(points: Floats, azimuth: Floats, length: Floats) -> tuple[dict[str, npt.NDArray[np.float64]], Floats]:
     """Pieces of a part, and the chainages of its vertices."""
     kept = np.flatnonzero(length > _SAME_PLACE_M)
     vertices_m = np.concatenate([[0.0], np.cumsum(np.where(length > _SAME_PLACE_M, length, 0.0))])
@@ -393,7 +385,7 @@ def _pieces(
     }, vertices_m
 
 
-def _cuts(length: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+def _cuts(length: Floats) -> tuple[IntArray, Floats, Floats]:
     """Edges cut into pieces: the edge, the distance from its start and the length of each."""
     edge, step, size = [], [], []
     for k, metres in enumerate(length.tolist()):
@@ -408,7 +400,7 @@ def _cuts(length: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
     return np.array(edge, dtype=np.intp), np.array(step), np.array(size)
 
 
-def _turns(starts: FloatArray, azimuth: FloatArray, length: FloatArray, points: FloatArray) -> FloatArray:
+def _turns(starts: Floats, azimuth: Floats, length: Floats, points: Floats) -> Floats:
     """Tangent of half the turn at the start of each edge and at the end of the last one, left positive."""
     _, _, back = _GEOD.fwd(starts[:, 0], starts[:, 1], azimuth, length)
     arriving = np.asarray(back) + 180.0
@@ -420,7 +412,7 @@ def _turns(starts: FloatArray, azimuth: FloatArray, length: FloatArray, points: 
     return np.where(np.abs(angle) <= _CORNER_RAD, np.tan(angle / 2), 0.0)
 
 
-def _frames(lon_deg: FloatArray, lat_deg: FloatArray, azimuth_deg: FloatArray) -> tuple[FloatArray, ...]:
+def _frames(lon_deg: Floats, lat_deg: Floats, azimuth_deg: Floats) -> tuple[Floats, ...]:
     """Starts of pieces and their unit vectors forward and left, earth-centred, each of shape (N, 3)."""
     lon, lat, azimuth = np.radians(lon_deg), np.radians(lat_deg), np.radians(azimuth_deg)
     east = np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=-1)

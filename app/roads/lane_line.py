@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 from pyproj import Geod
 
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat, enu_from_wgs84, lon_lat_from_enu
+from app.values import Floats
 
-FloatArray = npt.NDArray[np.float64]
 MAX_LENGTH_M = 20_000.0
 """Longest line. [m] In a longer one the plane frame turns bearings by more than a magnet's tolerance."""
 _MAX_POINTS = 100_000  # of a line; bounds the time
@@ -27,8 +26,8 @@ class LaneLine:
     """A line in the direction of travel, e.g. a lane's centre line or a painted line."""
 
     origin: tuple[float, float, float]  # of the local east, north, up frame: the line's first point
-    points_enu_m: FloatArray  # shape (K, 3): [m] vertices; up follows the ellipsoid away from the origin
-    chainages_m: FloatArray  # shape (K,): [m] of the vertices, from 0
+    points_enu_m: Floats  # shape (K, 3): [m] vertices; up follows the ellipsoid away from the origin
+    chainages_m: Floats  # shape (K,): [m] of the vertices, from 0
 
     @classmethod
     def from_lon_lat(cls, points_deg: Sequence[Sequence[float]], height_m: float = 0.0) -> LaneLine:
@@ -74,18 +73,18 @@ class LaneLine:
         """Chainage of its end. [m]"""
         return float(self.chainages_m[-1])
 
-    def at(self, chainage_m: float | FloatArray) -> FloatArray:
+    def at(self, chainage_m: float | Floats) -> Floats:
         """Places on the line, shape (..., 3), east, north, up; outside it, its ends. [m]"""
         return np.stack([np.interp(chainage_m, self.chainages_m, self.points_enu_m[:, k]) for k in range(3)], axis=-1)
 
-    def direction_at(self, chainage_m: float) -> FloatArray:
+    def direction_at(self, chainage_m: float) -> Floats:
         """Unit vector of travel, shape (3,): east, north, up."""
         last = len(self.chainages_m) - 2
         i = min(max(int(np.searchsorted(self.chainages_m, chainage_m, side="right")) - 1, 0), last)
-        step: FloatArray = self.points_enu_m[i + 1] - self.points_enu_m[i]
+        step: Floats = self.points_enu_m[i + 1] - self.points_enu_m[i]
         return step / float(np.linalg.norm(step))
 
-    def locate(self, point_enu_m: FloatArray) -> tuple[float, float]:
+    def locate(self, point_enu_m: Floats) -> tuple[float, float]:
         """Chainage of the nearest place on the line and the offset from it, left positive. [m]"""
         starts, steps = self.points_enu_m[:-1, :2], np.diff(self.points_enu_m[:, :2], axis=0)
         squared = np.sum(steps**2, axis=1)
@@ -96,22 +95,22 @@ class LaneLine:
         chainage = self.chainages_m[i] + share[i] * (self.chainages_m[i + 1] - self.chainages_m[i])
         return float(chainage), math.copysign(float(np.linalg.norm(away[i])), left)
 
-    def lon_lat(self, points_enu_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def lon_lat(self, points_enu_m: Floats) -> tuple[Floats, Floats]:
         """Longitudes and latitudes of points of the local frame, shape (..., 3). [deg]"""
         return lon_lat_from_enu(points_enu_m, self.origin)
 
-    def from_position(self, lon_deg: float, lat_deg: float) -> FloatArray:
+    def from_position(self, lon_deg: float, lat_deg: float) -> Floats:
         """A position in the local frame, shape (3,). [m]"""
         return enu_from_wgs84(lon_deg, lat_deg, self.origin[2], self.origin)
 
 
-def left_of(direction: FloatArray) -> FloatArray:
+def left_of(direction: Floats) -> Floats:
     """Level unit vector to the left of a direction, shape (3,)."""
     left = np.array([-direction[1], direction[0], 0.0])
     return left / float(np.linalg.norm(left))
 
 
-def bearing_deg(direction: FloatArray) -> float:
+def bearing_deg(direction: Floats) -> float:
     """Clockwise from true north, 0 to 360. [deg]"""
     return math.degrees(math.atan2(direction[0], direction[1])) % 360.0
 
@@ -126,7 +125,7 @@ _MAX_MITRE_RAD = np.radians(170.0)  # [rad] of turn at a vertex; a mitre of 11 o
 _GEOD = Geod(ellps="WGS84")
 
 
-def cut_edges(points_deg: FloatArray) -> FloatArray:
+def cut_edges(points_deg: Floats) -> Floats:
     """A line of geodesics with vertices on them, so that no edge is longer than 500 m.
 
     Parameters
@@ -153,7 +152,7 @@ def cut_edges(points_deg: FloatArray) -> FloatArray:
     return np.concatenate(cut)
 
 
-def parallel_line(points_deg: FloatArray, offset_m: float) -> FloatArray:
+def parallel_line(points_deg: Floats, offset_m: float) -> Floats:
     """The line at an offset from another: one vertex for each, where the neighbouring edges' parallels meet.
 
     Parameters
@@ -209,8 +208,8 @@ class Section:
     """A stretch of one part with rising measures; both arrays have the shape (K,) and rise. [m]"""
 
     part: int
-    chainages_m: FloatArray
-    measures_m: FloatArray
+    chainages_m: Floats
+    measures_m: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +218,7 @@ class Measures:
 
     sections: tuple[Section, ...]
     _starts: list[tuple[int, float]] = field(init=False, repr=False, compare=False)  # part and chainage of each section
-    _ends_m: FloatArray = field(init=False, repr=False, compare=False)  # lowest and highest measure, shape (2, S)
+    _ends_m: Floats = field(init=False, repr=False, compare=False)  # lowest and highest measure, shape (2, S)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_starts", [(s.part, float(s.chainages_m[0])) for s in self.sections])
@@ -310,7 +309,7 @@ def _check_places(points: list[CalibrationPoint]) -> None:
             )
 
 
-def _check_rising(knots_m: FloatArray) -> None:
+def _check_rising(knots_m: Floats) -> None:
     scales = np.diff(knots_m[:, 1]) / np.diff(knots_m[:, 0])
     wrong = np.flatnonzero((scales < SCALES[0]) | (scales > SCALES[1]))
     if len(wrong):

@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Field, with_config
 
 from app.errors import InvalidParameter
 from app.inputs import Declaration, Number, Whole
+from app.values import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,8 +179,6 @@ class CameraDeclaration(Declaration):
 
 # === The board that cameras are calibrated with: a chessboard whose white squares hold ArUco markers (ChArUco).
 
-
-Floats = npt.NDArray[np.float64]
 
 DICTIONARY: Literal["DICT_5X5_100"] = "DICT_5X5_100"
 MODULES = 7

@@ -12,8 +12,7 @@ from pydantic import Field, model_validator
 
 from app.errors import InvalidParameter
 from app.inputs import Declaration, Number
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 MAX_SENSORS = 64
 """Sensors of a bar at most. METRO's has 14 (section 6.1)."""

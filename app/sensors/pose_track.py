@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from app.errors import InvalidParameter
 from app.geodesy.frames import metres_per_radian
 from app.markers.cerpm import LaneSide, SpeedLimit
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 MIN_STEP_M = 5.0  # [m] shorter steps are the receiver's noise; docs/fleet.md
 MAX_STEP_M = 50.0  # [m] of inaccurate receivers

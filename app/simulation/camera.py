@@ -18,12 +18,11 @@ from app.compiled import kernel, step
 from app.errors import InvalidParameter
 from app.simulation.plate_face import smooth_noise
 from app.simulation.plate_scene import Air, FaceTruth, PlacedFace, PlateScene, Sensor, Shadow, face_truth
+from app.values import Floats, Floats32
 
 # === Shadows: how much light arrives on each spot of the road.
 
 
-FloatArray = npt.NDArray[np.float32]
-Matrix = npt.NDArray[np.float64]
 _CELLS, _CELL_M = 600, 0.015
 
 
@@ -31,8 +30,8 @@ _CELLS, _CELL_M = 600, 0.015
 class Shade:
     """Light on a square patch of road; beyond it the values of its border hold."""
 
-    share: FloatArray  # float32, shape (N, N): of the full light, 0 to 1; a single value is everywhere
-    cell_from_ground: Matrix  # shape (2, 3): affine map from the ground frame to columns and rows
+    share: Floats32  # float32, shape (N, N): of the full light, 0 to 1; a single value is everywhere
+    cell_from_ground: Floats  # shape (2, 3): affine map from the ground frame to columns and rows
 
     @property
     def varies(self) -> bool:
@@ -53,7 +52,7 @@ def shade_map(scene: PlateScene) -> Shade:
 
 
 @lru_cache(maxsize=8)
-def _shade_field(shadow: Shadow) -> FloatArray:
+def _shade_field(shadow: Shadow) -> Floats32:
     """Share of light, columns ahead, rows to the left."""
     at_m = (np.arange(_CELLS, dtype=np.float32) - _CELLS / 2) * np.float32(_CELL_M)
     field = np.ones((_CELLS, _CELLS), np.float32)
@@ -76,20 +75,20 @@ def _shade_field(shadow: Shadow) -> FloatArray:
 
 @kernel
 def accumulate_face(
-    rays: Matrix,
-    samples: Matrix,
-    row_time_s: Matrix,
-    motion: Matrix,
-    spin: Matrix,
+    rays: Floats,
+    samples: Floats,
+    row_time_s: Floats,
+    motion: Floats,
+    spin: Floats,
     height_m: float,
-    face_from_ground: Matrix,
-    reflectance: FloatArray,
-    emission: FloatArray,
-    light: FloatArray,
-    shade: FloatArray,
-    shade_from_ground: Matrix,
-    out: FloatArray,
-    cover: FloatArray,
+    face_from_ground: Floats,
+    reflectance: Floats32,
+    emission: Floats32,
+    light: Floats32,
+    shade: Floats32,
+    shade_from_ground: Floats,
+    out: Floats32,
+    cover: Floats32,
 ) -> None:  # pragma: no cover - compiled
     """Integrate what each pixel sees of a square on the road over its area and the exposure.
 
@@ -152,7 +151,7 @@ def accumulate_face(
 
 @step
 def _ground(
-    ray: Matrix, du: float, dv: float, t: float, motion: Matrix, spin: Matrix, height_m: float
+    ray: Floats, du: float, dv: float, t: float, motion: Floats, spin: Floats, height_m: float
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """Where a spot of a pixel looks at the road at time t; far away above the horizon."""
     dx = ray[0, 0] + du * ray[1, 0] + dv * ray[2, 0]
@@ -167,14 +166,14 @@ def _ground(
 
 @kernel
 def _misses(
-    ray: Matrix,
+    ray: Floats,
     row_time_s: float,
     begin: float,
     end: float,
-    motion: Matrix,
-    spin: Matrix,
+    motion: Floats,
+    spin: Floats,
     height_m: float,
-    face_from_ground: Matrix,
+    face_from_ground: Floats,
     size: int,
 ) -> bool:  # pragma: no cover - compiled
     """Whether the corners of a pixel's footprint at both ends of the exposure all lie beyond one side of the face."""
@@ -192,9 +191,7 @@ def _misses(
 
 
 @kernel
-def _bilinear(
-    field: FloatArray, field_from_ground: Matrix, gx: float, gy: float
-) -> float:  # pragma: no cover - compiled
+def _bilinear(field: Floats32, field_from_ground: Floats, gx: float, gy: float) -> float:  # pragma: no cover - compiled
     size = field.shape[0]
     if size == 1:
         return float(field[0, 0])
@@ -210,7 +207,7 @@ def _bilinear(
 
 @kernel
 def shade_rays(
-    rays: Matrix, height_m: float, shade: FloatArray, shade_from_ground: Matrix, out: FloatArray
+    rays: Floats, height_m: float, shade: Floats32, shade_from_ground: Floats, out: Floats32
 ) -> None:  # pragma: no cover - compiled
     """Share of the light that arrives where each ray meets the road; 1 above the horizon. ``out``: float32 (H, W)."""
     for i in range(out.shape[0]):
@@ -226,10 +223,10 @@ def shade_rays(
 @kernel
 def expose_photo(
     photo: npt.NDArray[np.uint8],
-    share: FloatArray,
-    encode: FloatArray,
-    sigma: FloatArray,
-    noise: FloatArray,
+    share: Floats32,
+    encode: Floats32,
+    sigma: Floats32,
+    noise: Floats32,
     offsets: npt.NDArray[np.int64],
     out: npt.NDArray[np.uint8],
 ) -> None:  # pragma: no cover - compiled
@@ -282,7 +279,7 @@ class Window:
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     @property
-    def grid(self) -> tuple[Matrix, Matrix]:
+    def grid(self) -> tuple[Floats, Floats]:
         """Row and column numbers."""
         return np.arange(self.top, self.bottom, dtype=float), np.arange(self.left, self.right, dtype=float)
 
@@ -347,7 +344,7 @@ def sample_count(pixels: int, blur_px: float) -> int:
 
 
 @lru_cache(maxsize=64)
-def _unit_samples(count: int) -> Matrix:
+def _unit_samples(count: int) -> Floats:
     """Points spread evenly over the unit cube (Kronecker sequence of the plastic number), mean exactly 0.5."""
     g = 1.2207440846057596
     points = np.mod(0.5 + np.arange(1, count + 1)[:, None] / g ** np.arange(1, 4), 1.0)
@@ -355,7 +352,7 @@ def _unit_samples(count: int) -> Matrix:
     return points
 
 
-def exposure_samples(count: int, exposure_s: float, lag_s: float = 0.0) -> Matrix:
+def exposure_samples(count: int, exposure_s: float, lag_s: float = 0.0) -> Floats:
     """Where and when a pixel gathers light.
 
     Parameters
@@ -375,7 +372,7 @@ def exposure_samples(count: int, exposure_s: float, lag_s: float = 0.0) -> Matri
     return np.column_stack([unit[:, :2] - 0.5, when])
 
 
-def directions(scene: PlateScene, cols: Matrix, rows: Matrix) -> Matrix:
+def directions(scene: PlateScene, cols: Floats, rows: Floats) -> Floats:
     """Direction in the ground frame of image points, any shape (...,) to (..., 3)."""
     camera = scene.camera
     points = np.stack([cols, rows], axis=-1).astype(np.float64)
@@ -385,11 +382,11 @@ def directions(scene: PlateScene, cols: Matrix, rows: Matrix) -> Matrix:
     else:
         ideal = (points - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
     rotation = scene.camera_from_ground
-    towards: Matrix = ideal @ rotation[:2] + rotation[2]
+    towards: Floats = ideal @ rotation[:2] + rotation[2]
     return towards
 
 
-def pixel_rays(scene: PlateScene, window: Window) -> Matrix:
+def pixel_rays(scene: PlateScene, window: Window) -> Floats:
     """Directions of a window's pixels and their derivatives by column and row, shape (H, W, 3, 3)."""
     cols = np.arange(window.left, window.right + 1) - 0.5
     rows = np.arange(window.top, window.bottom + 1) - 0.5
@@ -411,13 +408,13 @@ Image = npt.NDArray[np.uint8]
 
 
 @lru_cache(maxsize=1)
-def linear_from_srgb() -> FloatArray:
+def linear_from_srgb() -> Floats32:
     """Radiance of each value of an 8-bit photo, shape (256,)."""
     v = np.arange(256) / 255
     return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def tone(radiance: FloatArray, sensor: Sensor) -> FloatArray:
+def tone(radiance: Floats32, sensor: Sensor) -> Floats32:
     """Encoded value, 0 to 255 and not rounded, of a radiance after gains: shoulder, clipping, gamma."""
     knee = sensor.shoulder
     x = np.clip(radiance, 0, None)
@@ -429,18 +426,18 @@ def tone(radiance: FloatArray, sensor: Sensor) -> FloatArray:
     return np.asarray(255 * encoded, np.float32)
 
 
-def noise_sigma(radiance: FloatArray, sensor: Sensor) -> FloatArray:
+def noise_sigma(radiance: Floats32, sensor: Sensor) -> Floats32:
     """Standard deviation of the sensor's noise before gains, as a share of saturation: shot and read noise."""
     electrons = np.clip(radiance, 0, None) * sensor.full_well_e + sensor.read_noise_e**2
     return np.asarray(np.sqrt(electrons) / sensor.full_well_e, np.float32)
 
 
-def through_air(radiance: FloatArray, air: Air) -> FloatArray:
+def through_air(radiance: Floats32, air: Air) -> Floats32:
     """Radiance that reaches the lens through haze."""
     return np.asarray(radiance * (1 - air.haze) + air.airlight * air.haze, np.float32)
 
 
-def develop(radiance: FloatArray, air: Air, sensor: Sensor, rng: np.random.Generator) -> Image:
+def develop(radiance: Floats32, air: Air, sensor: Sensor, rng: np.random.Generator) -> Image:
     """Frame of a radiance, shape (H, W, 3): air, noise, colour mosaic, gains, tone, sharpening.
 
     The mosaic's first pixel is red, so a part of a frame must start at an even row and column.
@@ -462,7 +459,7 @@ def develop(radiance: FloatArray, air: Air, sensor: Sensor, rng: np.random.Gener
     return np.asarray(np.clip(encoded + 0.5, 0, 255), np.uint8)
 
 
-def _mosaic(light: FloatArray) -> FloatArray:
+def _mosaic(light: Floats32) -> Floats32:
     """One colour a pixel: red top-left, blue bottom-right, green else."""
     raw = light[..., 1].copy()
     raw[0::2, 0::2] = light[0::2, 0::2, 2]
@@ -470,12 +467,12 @@ def _mosaic(light: FloatArray) -> FloatArray:
     return raw
 
 
-def blurred(light: FloatArray, sigma_px: float) -> FloatArray:
+def blurred(light: Floats32, sigma_px: float) -> Floats32:
     """Light spread by a Gaussian lens."""
     return np.asarray(cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
-def shift_colours(radiance: FloatArray, shift_px: float) -> FloatArray:
+def shift_colours(radiance: Floats32, shift_px: float) -> Floats32:
     """Move blue and red sideways against each other."""
     out = radiance.copy()
     size = (radiance.shape[1], radiance.shape[0])
@@ -555,7 +552,7 @@ def _photo_gain(scene: PlateScene) -> np.float32:
     return np.float32(1.0 if scene.night_light is None else scene.night_light)
 
 
-def _light(scene: PlateScene, background: Image, truth: FaceTruth) -> FloatArray:
+def _light(scene: PlateScene, background: Image, truth: FaceTruth) -> Floats32:
     """Radiance of a white diffuser where a face lies, from the brightness of the road around it."""
     if scene.night_light is not None:
         return np.full(3, scene.night_light, np.float32)
@@ -584,7 +581,7 @@ def _expose_background(scene: PlateScene, photo: Image, shade: Shade, rng: np.ra
     return image
 
 
-def _shade_at(scene: PlateScene, shade: Shade, rows: Matrix, cols: Matrix) -> FloatArray:
+def _shade_at(scene: PlateScene, shade: Shade, rows: Floats, cols: Floats) -> Floats32:
     """Share of the light that arrives where pixels of a grid look at the road."""
     share = np.empty((len(rows), len(cols)), np.float32)
     rays = directions(scene, *np.meshgrid(cols, rows))
@@ -592,7 +589,7 @@ def _shade_at(scene: PlateScene, shade: Shade, rows: Matrix, cols: Matrix) -> Fl
     return share
 
 
-def _encoded_with_noise(scene: PlateScene, radiance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _encoded_with_noise(scene: PlateScene, radiance: Floats32) -> tuple[Floats32, Floats32]:
     """Encoded values and their noise [grey levels] of radiances, channels on axis 1."""
     sensor = scene.sensor
     gains = np.array(sensor.white_balance, np.float32)[None, :, None]
@@ -603,7 +600,7 @@ def _encoded_with_noise(scene: PlateScene, radiance: FloatArray) -> tuple[FloatA
 
 
 @lru_cache(maxsize=4)
-def _normal_numbers(seed: int) -> FloatArray:
+def _normal_numbers(seed: int) -> Floats32:
     """A fixed row of standard normal numbers: rows of a frame start at random places in it, for speed."""
     return np.random.default_rng(7_000 + seed).standard_normal(_NOISE_LENGTH, dtype=np.float32)
 
@@ -614,7 +611,7 @@ def _normal_numbers(seed: int) -> FloatArray:
 def _paint(
     scene: PlateScene,
     members: list[int],
-    lights: list[FloatArray],
+    lights: list[Floats32],
     window: Window,
     background: Image,
     shade: Shade,
@@ -642,12 +639,12 @@ def _paint(
 def gather_faces(
     scene: PlateScene,
     members: list[int],
-    lights: list[FloatArray],
+    lights: list[Floats32],
     window: Window,
-    rays: Matrix,
+    rays: Floats,
     shade: Shade,
     lag_s: float = 0.0,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Floats32, Floats32]:
     """Radiance from faces and the share of each pixel that they fill, integrated over pixel area and exposure.
 
     Parameters
@@ -680,7 +677,7 @@ def gather_faces(
     return radiance, cover
 
 
-def _glare(scene: PlateScene, rays: Matrix) -> FloatArray:
+def _glare(scene: PlateScene, rays: Floats) -> Floats32:
     """Mirrored light of the first face at each pixel."""
     ground = rays[:, :, 0, :2] * (scene.camera.height_m / np.maximum(-rays[:, :, 0, 2], 1e-6))[..., None]
     first = scene.faces[0]
@@ -689,7 +686,7 @@ def _glare(scene: PlateScene, rays: Matrix) -> FloatArray:
     return np.asarray(scene.air.glare * np.exp(-0.5 * (scaled**2).sum(axis=-1)), np.float32)
 
 
-def _occlude(radiance: FloatArray, scene: PlateScene, window: Window) -> FloatArray:
+def _occlude(radiance: Floats32, scene: PlateScene, window: Window) -> Floats32:
     occluder = scene.occluder
     assert occluder is not None
     angle = math.radians(occluder.angle_deg)

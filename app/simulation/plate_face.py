@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
+from app.values import Floats32
 
-FloatArray = npt.NDArray[np.float32]
 Colour = tuple[float, float, float]
 _MAX_TEXELS = 800
 
@@ -57,8 +57,8 @@ class Face:
     side_m: float  # [m] outer side
     # `reflectance`, `emission`: float32, shape (T, T, 3): Diffuse reflectance, and radiance that it emits by itself;
     # the latter may be None
-    reflectance: FloatArray = field(repr=False)
-    emission: FloatArray | None = field(default=None, repr=False)
+    reflectance: Floats32 = field(repr=False)
+    emission: Floats32 | None = field(default=None, repr=False)
 
 
 def draw_look(rng: np.random.Generator) -> PlateLook:
@@ -128,7 +128,7 @@ def plate_face(
     return Face(geometry.side_mm / 1000, reflectance, emission)
 
 
-def _lit(shares: FloatArray, look: PlateLook, texels_per_mm: float) -> FloatArray:
+def _lit(shares: Floats32, look: PlateLook, texels_per_mm: float) -> Floats32:
     """Radiance of the light units and markers with light sources below them."""
     glow = shares[2][..., None] * np.ones(3, np.float32)
     if look.led_markers:
@@ -160,7 +160,7 @@ def grid_face(cells: npt.ArrayLike, side_m: float, wear: PlateWear, rng: np.rand
     return Face(side_m, _worn(crisp, wear, side_m * 1000, rng), emission)
 
 
-def material_shares(code: PlateCode, geometry: PlateGeometry, size: int) -> FloatArray:
+def material_shares(code: PlateCode, geometry: PlateGeometry, size: int) -> Floats32:
     """Share of each texel that is gap, dark, light, red, green, free half of the triangle's cell.
 
     Returns
@@ -208,7 +208,7 @@ def _triangle_cover(start_mm: float, leg_mm: float, side_mm: float, size: int) -
     return cover
 
 
-def smooth_noise(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> FloatArray:
+def smooth_noise(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> Floats32:
     """Smooth random field with values spread evenly over 0 to 1, features about ``scale`` texels wide."""
     coarse = (int(np.ceil(shape[0] / scale)) + 3, int(np.ceil(shape[1] / scale)) + 3)
     field = rng.random(coarse, dtype=np.float32)
@@ -217,7 +217,7 @@ def smooth_noise(shape: tuple[int, int], scale: float, rng: np.random.Generator)
     return np.asarray(np.clip(big[top : top + shape[0], left : left + shape[1]], 0, 1), np.float32)
 
 
-def _worn(reflectance: FloatArray, wear: PlateWear, side_mm: float, rng: np.random.Generator) -> FloatArray:
+def _worn(reflectance: Floats32, wear: PlateWear, side_mm: float, rng: np.random.Generator) -> Floats32:
     size = reflectance.shape[0]
     texels_per_mm = size / side_mm
     mean = reflectance.mean(axis=(0, 1))
@@ -235,7 +235,7 @@ def _worn(reflectance: FloatArray, wear: PlateWear, side_mm: float, rng: np.rand
     return np.ascontiguousarray(out, np.float32)
 
 
-def _stained(face: FloatArray, radius: float, dust: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _stained(face: Floats32, radius: float, dust: Floats32, rng: np.random.Generator) -> Floats32:
     """One stain with a ragged edge."""
     size = face.shape[0]
     x0, y0 = rng.uniform(0, size, 2)
@@ -258,8 +258,8 @@ def _stained(face: FloatArray, radius: float, dust: FloatArray, rng: np.random.G
 
 
 def _painted(
-    face: FloatArray, half_axes_mm: tuple[float, float], texels_per_mm: float, rng: np.random.Generator
-) -> FloatArray:
+    face: Floats32, half_axes_mm: tuple[float, float], texels_per_mm: float, rng: np.random.Generator
+) -> Floats32:
     """One spot of paint, an ellipse with a sharp edge."""
     size = face.shape[0]
     axes = rng.uniform(*half_axes_mm, 2) * texels_per_mm
@@ -270,5 +270,5 @@ def _painted(
     cover = cv2.GaussianBlur(mask.astype(np.float32) / 255, (0, 0), 1.0) * np.float32(rng.uniform(0.7, 1.0))
     tones = ((0.02, 0.12), (0.5, 0.95), (0.15, 0.45))
     paint = np.float32(rng.uniform(*tones[int(rng.choice(3, p=(0.35, 0.35, 0.3)))]))
-    painted: FloatArray = face + (paint - face) * cover[..., None]
+    painted: Floats32 = face + (paint - face) * cover[..., None]
     return painted

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from app.sensors.camera import Camera
 from app.simulation.plate_face import Face
-
-Matrix = npt.NDArray[np.float64]
+from app.values import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,21 +28,21 @@ class PlacedFace:
     rotation_deg: float = 0.0  # [deg] clockwise, seen from above, from the vehicle's heading to the face's up direction
 
     @property
-    def ground_from_face(self) -> Matrix:
+    def ground_from_face(self) -> Floats:
         """Rotation (columns: the face's right, up, out of the road) in the ground frame, shape (3, 3)."""
         a = math.radians(self.rotation_deg)
         return np.array([[-math.sin(a), math.cos(a), 0], [-math.cos(a), -math.sin(a), 0], [0, 0, 1.0]])
 
     @property
-    def corners_ground_m(self) -> Matrix:
+    def corners_ground_m(self) -> Floats:
         """Outer corners, clockwise from top-left, shape (4, 3). [m]"""
         half = self.face.side_m / 2
         corners = np.array([(-half, half, 0), (half, half, 0), (half, -half, 0), (-half, -half, 0)])
-        placed: Matrix = corners @ self.ground_from_face.T + (self.ahead_m, self.left_m, 0)
+        placed: Floats = corners @ self.ground_from_face.T + (self.ahead_m, self.left_m, 0)
         return placed
 
     @property
-    def texel_from_ground(self) -> Matrix:
+    def texel_from_ground(self) -> Floats:
         """Affine map from ground x, y to columns, rows of the face's texture, shape (2, 3)."""
         size = self.face.reflectance.shape[0]
         scale = size / self.face.side_m
@@ -139,22 +138,22 @@ class PlateScene:
     occluder: Occluder | None = None
 
     @property
-    def camera_from_ground(self) -> Matrix:
+    def camera_from_ground(self) -> Floats:
         """Rotation from the ground frame to the camera frame at mid-exposure, shape (3, 3)."""
         roll, pitch, yaw = (math.radians(v) for v in self.body_deg)
         ground_from_vehicle = cv2.Rodrigues(np.array([0, 0, yaw]))[0]
         ground_from_vehicle = ground_from_vehicle @ cv2.Rodrigues(np.array([0, pitch, 0.0]))[0]
         ground_from_vehicle = ground_from_vehicle @ cv2.Rodrigues(np.array([roll, 0, 0.0]))[0]
-        rotation: Matrix = self.camera.camera_from_vehicle @ ground_from_vehicle.T
+        rotation: Floats = self.camera.camera_from_vehicle @ ground_from_vehicle.T
         return rotation
 
-    def row_time_s(self, rows: npt.ArrayLike) -> Matrix:
+    def row_time_s(self, rows: npt.ArrayLike) -> Floats:
         """Mid-exposure of image rows relative to the frame's. [s]"""
         share = (np.asarray(rows, float) - (self.camera.height_px - 1) / 2) / max(self.camera.height_px - 1, 1)
-        times: Matrix = share * self.sensor.readout_s
+        times: Floats = share * self.sensor.readout_s
         return times
 
-    def project(self, points_ground_m: Matrix) -> Matrix:
+    def project(self, points_ground_m: Floats) -> Floats:
         """Image of points on the road at their rows' mid-exposure; behind the camera: NaN.
 
         Parameters
@@ -174,7 +173,7 @@ class PlateScene:
             times = self.row_time_s(np.clip(rows, -self.camera.height_px, 2 * self.camera.height_px))
         return image
 
-    def project_at(self, points_ground_m: Matrix, times_s: Matrix) -> Matrix:
+    def project_at(self, points_ground_m: Floats, times_s: Floats) -> Floats:
         """Image of points on the road at given times from mid-exposure [s]; behind the camera: NaN. [px]"""
         offset = points_ground_m - (0, 0, self.camera.height_m)
         offset = offset - times_s[:, None] * np.array([self.speed_m_s, 0, 0])
@@ -199,15 +198,15 @@ class FaceTruth:
     """Where a square really is."""
 
     # shape (4, 2): [px] outer corners at mid-exposure, clockwise from top-left; NaN behind the camera
-    corners_px: Matrix
+    corners_px: Floats
     in_view: bool  # all four corners are inside the image
     partly_in_view: bool  # some of it is
     # `height_px`, `width_px`: [px] extent of the corners
     height_px: float
     width_px: float
-    camera_from_face: Matrix  # shape (3, 3): when the row that shows its centre is exposed, as are the next two
-    translation_m: Matrix  # shape (3,): [m] its centre in the camera frame
-    camera_position_m: Matrix  # shape (3,): [m] optical centre in the face's frame (x right, y up, z out of the road)
+    camera_from_face: Floats  # shape (3, 3): when the row that shows its centre is exposed, as are the next two
+    translation_m: Floats  # shape (3,): [m] its centre in the camera frame
+    camera_position_m: Floats  # shape (3,): [m] optical centre in the face's frame (x right, y up, z out of the road)
 
 
 def face_truth(scene: PlateScene, placed: PlacedFace) -> FaceTruth:
@@ -224,7 +223,7 @@ def face_truth(scene: PlateScene, placed: PlacedFace) -> FaceTruth:
     )
 
 
-def _pose_when_exposed(scene: PlateScene, placed: PlacedFace) -> tuple[Matrix, Matrix]:
+def _pose_when_exposed(scene: PlateScene, placed: PlacedFace) -> tuple[Floats, Floats]:
     """camera_from_face at the mid-exposure of the row that shows the face's centre."""
     centre = np.array([[placed.ahead_m, placed.left_m, 0.0]])
     row = np.nan_to_num(scene.project(centre)[0, 1], nan=0.0)

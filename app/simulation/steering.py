@@ -22,11 +22,10 @@ from app.lanes.control import (
     predict_pose,
     stanley_rad,
 )
+from app.values import Floats
 
 # === A car as a kinematic bicycle whose steering has limits, a lag and a delay, and the errors of its poses.
 
-
-Floats = npt.NDArray[np.float64]
 
 STEP_S = 0.01  # [s] time step of simulation and controller; 100 Hz
 

@@ -12,11 +12,12 @@ import scipy
 from typing_extensions import TypedDict
 
 from app.formats.surveys.declaration import ImportDeclaration
-from app.formats.surveys.table import Fault, Floats, Severity, warn
+from app.formats.surveys.table import Fault, Severity, warn
 from app.geodesy import move_to_epoch
 from app.surveys.consistency_checks import nearest_of
 from app.surveys.georeference import GeoreferencedSurvey, east_north_m
 from app.surveys.location_checks import measured_changes
+from app.values import Floats
 
 REACH_M = 30.0
 """Longest residual of a row that is matched to its nearest marker; a longer one of a named marker is refused if it is

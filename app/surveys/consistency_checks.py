@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from app.formats.surveys.table import Change, Fault, Floats, Severity, warn
+from app.formats.surveys.table import Change, Fault, Severity, warn
 from app.surveys.georeference import GeoreferencedSurvey
-
-Flags = npt.NDArray[np.bool_]
+from app.values import Bools, Floats
 
 _STRIDES = (1, 2, 3, 4)  # rows to the next of the same line: 2 where left and right boundaries alternate
 _OFF_M = 9.0  # [m] a row farther off the line than this is reported whatever the scatter
@@ -156,9 +155,9 @@ class _Around:
         for start in range(0, len(points) - 4 * stride, _PART):
             yield cls.of(points[start : start + _PART + 4 * stride], stride)
 
-    def is_off(self, threshold_m: float) -> Flags:
+    def is_off(self, threshold_m: float) -> Bools:
         """Rows that are not where the four rows around them lead."""
-        off: Flags = self.regular & (self.off_m > threshold_m) | ~self.regular & self.straight & self.spike
+        off: Bools = self.regular & (self.off_m > threshold_m) | ~self.regular & self.straight & self.spike
         return off
 
     @property
@@ -167,21 +166,21 @@ class _Around:
         return _length(self.at - (4 * (self.b + self.c) - self.a - self.d) / 6)
 
     @property
-    def regular(self) -> Flags:
+    def regular(self) -> Bools:
         """The four are evenly spaced, but for the row between them."""
         steps = np.stack([_length(self.b - self.a), _length(self.c - self.b) / 2, _length(self.d - self.c)])
         middle = np.median(steps, axis=0)
         return np.all(np.abs(steps - middle) <= _REGULAR * middle + 0.5, axis=0)  # type: ignore[no-any-return]
 
     @property
-    def straight(self) -> Flags:
+    def straight(self) -> Bools:
         """The four turn by less than 25 degrees."""
         first, chord, last = self.b - self.a, self.c - self.b, self.d - self.c
-        straight: Flags = (_cosine(first, chord) > _STRAIGHT_COS) & (_cosine(chord, last) > _STRAIGHT_COS)
+        straight: Bools = (_cosine(first, chord) > _STRAIGHT_COS) & (_cosine(chord, last) > _STRAIGHT_COS)
         return straight
 
     @property
-    def spike(self) -> Flags:
+    def spike(self) -> Bools:
         """The row lies far beside, before or behind the two beside it, which it should be between."""
         chord = self.c - self.b
         length = np.maximum(_length(chord), 1e-6)
@@ -189,7 +188,7 @@ class _Around:
         across = np.abs(chord[:, 0] * offset[:, 1] - chord[:, 1] * offset[:, 0]) / length
         along = (chord * offset).sum(axis=1) / length
         beyond = np.maximum(-along, along - length)
-        spike: Flags = (across > np.maximum(5.0, 0.3 * length)) | (across > _OFF_M) | (beyond > 3.0)
+        spike: Bools = (across > np.maximum(5.0, 0.3 * length)) | (across > _OFF_M) | (beyond > 3.0)
         return spike
 
 

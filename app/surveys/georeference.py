@@ -17,8 +17,9 @@ from typing_extensions import TypedDict
 from app.errors import InvalidParameter, WaymarkError
 from app.formats.surveys.coordinates import crs_unit, unit_factor, without_zone
 from app.formats.surveys.declaration import METRES, ControlPoint, ImportDeclaration, LocalGrid
-from app.formats.surveys.table import Change, Fault, Floats, SurveyTable, Texts, warn
+from app.formats.surveys.table import Change, Fault, SurveyTable, Texts, warn
 from app.geodesy import PlacedPositions, place_positions, reference_system
+from app.values import Floats
 
 # === Surveys in a local grid: a similarity transformation to the CRS by least squares, checked by its residuals.
 

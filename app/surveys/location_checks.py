@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.formats.surveys.declaration import ImportDeclaration
-from app.formats.surveys.table import Change, Fault, Floats, Severity, warn
+from app.formats.surveys.table import Change, Fault, Severity, warn
 from app.geodesy import reference_system
 from app.surveys.consistency_checks import check_height, nearest_of, zero_coordinate
 from app.surveys.georeference import (
@@ -22,6 +22,7 @@ from app.surveys.georeference import (
     list_alternatives,
     list_readings,
 )
+from app.values import Floats
 
 HasMarkersNear = Callable[[float, float], bool]
 """Whether markers are registered within some kilometres of a longitude and latitude."""

@@ -31,19 +31,8 @@ from app.tracks.measure import (
 from app.tracks.results import collect_track
 from app.tracks.start import DeadReckoning, dead_reckon, start_set, start_state
 from app.tracks.time_base import TimeBase, align_clocks, checked_clocks, find_jump, split_where_time_falls, time_base
-from app.tracks.types import (
-    CLOCKS,
-    HEADING,
-    NORTH,
-    Bools,
-    Clock,
-    Floats,
-    Ints,
-    PositionFix,
-    Track,
-    TrackInput,
-    TrackRules,
-)
+from app.tracks.types import CLOCKS, HEADING, NORTH, Clock, PositionFix, Track, TrackInput, TrackRules
+from app.values import Bools, Floats, Ints
 
 MAX_ROUNDS = 40
 """Rounds of smoothing and gating at most. Source: `python -m benchmarks.track`: 4 to 8 are needed, rarely 30."""

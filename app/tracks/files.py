@@ -10,7 +10,8 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from app.tracks.types import DriveMarker, FixResult, Floats, Ints, Track
+from app.tracks.types import DriveMarker, FixResult, Track
+from app.values import Floats, Ints
 
 CSV_COLUMNS = (
     "time", "lon_deg", "lat_deg", "heading_deg", "speed_m_s", "variance_east_m2", "covariance_east_north_m2",

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from app.compiled import ieee_kernel
 from app.tracks.types import BIAS, CLOCKS, EAST, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE
+from app.values import Floats, Ints
 
 # === How the state of a drive moves on from node to node, and how its errors grow.
 #
@@ -178,9 +179,6 @@ def predict(state, cov, around, dt, motion, out, out_cov, scratch):  # type: ign
 
 # === The error-state Kalman filter along a drive, and the Rauch-Tung-Striebel smoother behind it.
 
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 FIX, SPEED_SAMPLE, HEADING_SAMPLE, PATH = range(4)
 """Kinds of measurements."""

@@ -12,20 +12,8 @@ import scipy
 from app.geodesy.frames import ecef_from_wgs84, metres_per_radian
 from app.tracks.kernel import FIX, HEADING_SAMPLE, PATH, Measurements
 from app.tracks.time_base import TimeBase
-from app.tracks.types import (
-    HEADING,
-    NORTH,
-    SPEED,
-    YAW_RATE,
-    Bools,
-    Floats,
-    Ints,
-    LanePath,
-    PositionFix,
-    ReceiverResult,
-    Samples,
-    TrackRules,
-)
+from app.tracks.types import HEADING, NORTH, SPEED, YAW_RATE, LanePath, PositionFix, ReceiverResult, Samples, TrackRules
+from app.values import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from app.tracks.estimate import Smoothed

@@ -14,19 +14,17 @@ from app.tracks.types import (
     HEADING,
     SCALE,
     SPEED,
-    Bools,
     Clock,
     ClockOffset,
     ClockState,
     FixResult,
-    Floats,
-    Ints,
     LeftOutReason,
     PositionFix,
     Track,
     TrackGap,
     TrackRules,
 )
+from app.values import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from app.tracks.estimate import Segment, Smoothed

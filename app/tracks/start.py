@@ -10,7 +10,8 @@ import numpy as np
 
 from app.geodesy.frames import metres_per_radian
 from app.tracks.time_base import TimeBase
-from app.tracks.types import BIAS, HEADING, SCALE, SPEED, WANDER, YAW_RATE, Bools, Floats, Ints, PositionFix, Samples
+from app.tracks.types import BIAS, HEADING, SCALE, SPEED, WANDER, YAW_RATE, PositionFix, Samples
+from app.values import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from app.tracks.estimate import DriveData

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.errors import InvalidParameter
-from app.tracks.types import CLOCKS, MAX_CLOCK_SIGMA_S, Clock, Floats, Ints, PositionFix, Samples, TrackInput
+from app.tracks.types import CLOCKS, MAX_CLOCK_SIGMA_S, Clock, PositionFix, Samples, TrackInput
+from app.values import Floats, Ints
 
 if TYPE_CHECKING:
     from app.tracks.estimate import Segment

@@ -8,15 +8,12 @@ from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from app.errors import InvalidParameter
 from app.inputs import Declaration, Number
+from app.values import Bools, Floats
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
-Ints = npt.NDArray[np.int64]
 EAST, NORTH, HEADING, SPEED, YAW_RATE, SCALE, BIAS, WANDER, CLOCKS = range(9)
 """Places in the state (`app.tracks.kernel`); the offsets of the clocks follow from `CLOCKS` on."""
 

@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 from app.lanes.estimate import Lane
 from app.sensors.pose_track import PoseTrack
 from app.simulation.radio.lanes import TrueLane
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 NEAR_M = 1.0  # [m] a true place is covered if the path is within this
 MIN_CONFIDENCE = 0.5  # and if the path's confidence there is at least this

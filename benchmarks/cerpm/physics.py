@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
@@ -18,11 +17,10 @@ from app.radio.link import fit_path_loss
 from app.simulation.radio.drive import Multipath, SatelliteReceiver, drive_past
 from app.simulation.radio.lanes import TrueLane
 from app.simulation.radio.link import ANTENNA_M, AntennaPattern, Radio, TwoRay, mean_rssi_dbm
+from app.values import Floats
 from benchmarks.cerpm import scenes
 from benchmarks.cerpm.path_errors import Tally, path_errors, track_errors
 from benchmarks.cerpm.paths import Result, list_scenes, span_of
-
-Floats = npt.NDArray[np.float64]
 
 COMPARED_M = np.geomspace(5.0, 100.0, 50)
 """Distances at which a fitted path loss is compared. [m] Source: by hand; packets come from up to about 100 m."""

@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from app.decoders.cerpm.merge import MergedMarkers
 from app.encoders.cerpm import encode_message
@@ -19,8 +18,6 @@ from app.planning.cerpm_placement import place_markers
 from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_lane, observe_track
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_from_wgs84, make_lane
-
-Floats = npt.NDArray[np.float64]
 
 ROUTES = Path(__file__).parent / "routes"
 ROUTE_NAMES = ("karlsruhe_low_1", "karlsruhe_moderate_1", "tfhrc_bend_1", "tfhrc_low_1")

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import orjson
 from pyproj import Transformer
 
 from app.surveys.georeference import east_north_m
+from app.values import Floats
 
 ROUTES = Path(__file__).parents[1] / "cerpm" / "routes"
 LANES = ("karlsruhe_low_1", "karlsruhe_moderate_1", "tfhrc_bend_1", "tfhrc_low_1")
@@ -25,8 +25,6 @@ CRSS = {
     "t": ("EPSG:4326", "EPSG:26918", "EPSG:6347", "EPSG:6593"),
 }
 SPACINGS_M = (8.0, 12.0, 24.0)
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

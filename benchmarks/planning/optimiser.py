@@ -8,16 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from app.planning.alignment import Alignment
 from app.planning.optimise.cover import cheapest_cover, least_gain
 from app.planning.optimise.plan import optimise_by_prediction
 from app.planning.rules import PlanRules
+from app.values import Floats
 from benchmarks.planning.roads import LANES, generated_road, real_lane
 from benchmarks.planning.tables import Section, table
-
-Floats = npt.NDArray[np.float64]
 
 GOAL = 0.8
 """Share of the cost of even spacing on roads with bends, at most. Source: issue 13."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import orjson
 from pyproj import Geod
 
@@ -15,8 +14,8 @@ from app.formats.alignments.read import read_alignment
 from app.planning.alignment import Alignment
 from app.planning.build_alignment import build_alignment
 from app.planning.rules import RoadRules
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 DATA = Path(__file__).parent / "data"
 LANES = ("karlsruhe_low_1", "karlsruhe_moderate_1", "tfhrc_bend_1", "tfhrc_low_1")
 """Names of the real lanes."""

@@ -13,10 +13,10 @@ import segno
 from app.sensors.camera import Camera
 from app.simulation.plate_face import Face, PlateWear, grid_face
 from app.simulation.plate_scene import PlacedFace
+from app.values import Floats32
 from benchmarks.scenes.distractors import decoy_plate
 
 Image = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float32]
 Colour = tuple[float, float, float]
 TEXELS = 240
 """Texels along the side of a drawing."""
@@ -63,7 +63,7 @@ def paint_upright(photo: Image, rng: np.random.Generator, count: int) -> Image:
     return out
 
 
-def _levels(cells: Floats, light: float) -> Image:
+def _levels(cells: Floats32, light: float) -> Image:
     """Gamma encoded levels of linear reflectances under a light."""
     return np.asarray(255 * np.clip(light * cells, 0, 1) ** (1 / GAMMA), np.uint8)
 
@@ -72,7 +72,7 @@ def _draw_face(rng: np.random.Generator, wear: PlateWear) -> Face:
     return grid_face(_draw_cells(rng), float(rng.uniform(0.2, 0.6)), wear, rng)
 
 
-def _draw_cells(rng: np.random.Generator) -> Floats:
+def _draw_cells(rng: np.random.Generator) -> Floats32:
     """Reflectances of one look-alike, shape (TEXELS, TEXELS, 3)."""
     kinds = (
         _qr_code, _tiles, _chessboard, _panel, _warning_sign, _round_sign, _direction_sign, _marking, _bicycle_lane,
@@ -80,7 +80,7 @@ def _draw_cells(rng: np.random.Generator) -> Floats:
     return kinds[int(rng.integers(len(kinds)))](rng)
 
 
-def _resized(cells: npt.ArrayLike) -> Floats:
+def _resized(cells: npt.ArrayLike) -> Floats32:
     size = (TEXELS, TEXELS)
     return np.asarray(cv2.resize(np.asarray(cells, np.float32), size, interpolation=cv2.INTER_NEAREST), np.float32)
 
@@ -89,7 +89,7 @@ def _pick(rng: np.random.Generator, colours: Sequence[Colour]) -> Colour:
     return colours[int(rng.integers(len(colours)))]
 
 
-def _qr_code(rng: np.random.Generator) -> Floats:
+def _qr_code(rng: np.random.Generator) -> Floats32:
     """A QR code, some in colours, some with coloured finder patterns as red and green corners."""
     text = "".join(rng.choice(list("0123456789ABCDEF"), int(rng.integers(4, 40))))
     code = segno.make(text, micro=bool(len(text) < 8 and rng.random() < 0.3))
@@ -105,7 +105,7 @@ def _qr_code(rng: np.random.Generator) -> Floats:
     return _resized(cells)
 
 
-def _tiles(rng: np.random.Generator) -> Floats:
+def _tiles(rng: np.random.Generator) -> Floats32:
     """Floor tiles with joints, in two to five colours."""
     count = int(rng.integers(4, 13))
     palette = np.array([_pick(rng, COLOURS) for _ in range(int(rng.integers(2, 6)))])
@@ -118,7 +118,7 @@ def _tiles(rng: np.random.Generator) -> Floats:
     return cells
 
 
-def _chessboard(rng: np.random.Generator) -> Floats:
+def _chessboard(rng: np.random.Generator) -> Floats32:
     """A chessboard, some with red and green corners in any order."""
     count = int(rng.integers(4, 11))
     board = np.indices((count, count)).sum(axis=0) % 2
@@ -130,7 +130,7 @@ def _chessboard(rng: np.random.Generator) -> Floats:
     return _resized(cells)
 
 
-def _panel(rng: np.random.Generator) -> Floats:
+def _panel(rng: np.random.Generator) -> Floats32:
     """A board of one or two tones with coloured corners: mostly red and green squares as a plate has them."""
     count = int(rng.choice((8, 10, 12)))
     tones = np.array([_pick(rng, (WHITE, BLACK, ASPHALT)) for _ in range(int(rng.integers(1, 3)))])
@@ -145,15 +145,15 @@ def _panel(rng: np.random.Generator) -> Floats:
     return _resized(cells)
 
 
-def _sheet(colour: Colour) -> Floats:
+def _sheet(colour: Colour) -> Floats32:
     return np.full((TEXELS, TEXELS, 3), colour, np.float32)
 
 
-def _fill(cells: Floats, points: npt.ArrayLike, colour: Colour) -> None:
+def _fill(cells: Floats32, points: npt.ArrayLike, colour: Colour) -> None:
     cv2.fillPoly(cells, [np.round(np.asarray(points) * TEXELS).astype(np.int32)], colour)
 
 
-def _write(cells: Floats, text: str, at: tuple[float, float], size: float, colour: Colour) -> None:
+def _write(cells: Floats32, text: str, at: tuple[float, float], size: float, colour: Colour) -> None:
     place = (int(at[0] * TEXELS), int(at[1] * TEXELS))
     thick = max(int(TEXELS * size / 12), 1)
     letters = np.zeros((TEXELS, TEXELS), np.uint8)  # OpenCV writes on bytes only
@@ -161,7 +161,7 @@ def _write(cells: Floats, text: str, at: tuple[float, float], size: float, colou
     cells[letters > 0] = colour
 
 
-def _warning_sign(rng: np.random.Generator) -> Floats:
+def _warning_sign(rng: np.random.Generator) -> Floats32:
     """A red triangle on white, and the corner of a red one on asphalt."""
     cells = _sheet(_pick(rng, (ASPHALT, GREEN, WHITE)))
     _fill(cells, [(0.5, 0.05), (0.97, 0.92), (0.03, 0.92)], RED)
@@ -170,7 +170,7 @@ def _warning_sign(rng: np.random.Generator) -> Floats:
     return cells
 
 
-def _round_sign(rng: np.random.Generator) -> Floats:
+def _round_sign(rng: np.random.Generator) -> Floats32:
     """A speed limit, or a stop sign."""
     cells = _sheet(_pick(rng, (ASPHALT, GREEN, BLACK)))
     centre, radius = (TEXELS // 2, TEXELS // 2), int(0.47 * TEXELS)
@@ -183,7 +183,7 @@ def _round_sign(rng: np.random.Generator) -> Floats:
     return cells
 
 
-def _direction_sign(rng: np.random.Generator) -> Floats:
+def _direction_sign(rng: np.random.Generator) -> Floats32:
     """White letters and a frame on green, blue or red."""
     cells = _sheet(_pick(rng, (GREEN, BLUE, RED)))
     cv2.rectangle(cells, (6, 6), (TEXELS - 7, TEXELS - 7), WHITE, int(rng.integers(2, 8)))
@@ -193,7 +193,7 @@ def _direction_sign(rng: np.random.Generator) -> Floats:
     return cells
 
 
-def _marking(rng: np.random.Generator) -> Floats:
+def _marking(rng: np.random.Generator) -> Floats32:
     """White or yellow arrows, words and bars of paint on asphalt."""
     cells, paint = _sheet(ASPHALT), _pick(rng, (WHITE, YELLOW))
     kind = int(rng.integers(3))
@@ -212,7 +212,7 @@ def _pick_word(rng: np.random.Generator) -> str:
     return ("SLOW", "BUS", "STOP", "30", "TAXI", "50")[int(rng.integers(6))]
 
 
-def _bicycle_lane(rng: np.random.Generator) -> Floats:
+def _bicycle_lane(rng: np.random.Generator) -> Floats32:
     """White signs on red or green asphalt, with squares of the other colour beside them."""
     cells = _sheet(_pick(rng, (RED, GREEN)))
     for x in (0.3, 0.7):

@@ -12,7 +12,6 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import sqlalchemy as sa
 from scipy.spatial import cKDTree
 
@@ -27,8 +26,7 @@ from app.registry.features import feature_text
 from app.registry.marker_rows import MarkerRow, markers
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
-
-Array = npt.NDArray[np.float64]
+from app.values import Floats
 
 AREA_DEG = (6.0, 46.0, 4.0, 4.0)  # west, south, width, height: a country
 SPACING_M = 25.0
@@ -52,9 +50,9 @@ _SURVEY: dict[str, Any] = {
 class Network:
     """Where the markers are, in the order of their ids; road k // PER_ROAD."""
 
-    lon_deg: Array
-    lat_deg: Array
-    heading_deg: Array
+    lon_deg: Floats
+    lat_deg: Floats
+    heading_deg: Floats
 
     def boxes_of(self, features: int, count: int, seed: int) -> list[tuple[float, float, float, float]]:
         """Boxes round random markers that hold so many of them: west, south, east, north. [deg]"""

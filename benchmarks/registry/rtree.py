@@ -17,13 +17,11 @@ from tempfile import TemporaryDirectory
 from unittest import mock
 
 import numpy as np
-import numpy.typing as npt
 import sqlalchemy as sa
 
 from app.registry import bulk_load
 from app.registry.spatial import fill_rtree
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 _COLUMNS = "row, lon_deg, lon_deg, lat_deg, lat_deg"
 _QUERIES = 2_000

@@ -13,8 +13,9 @@ from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
-from app.simulation.plate_face import Colour, Face, FloatArray, PlateLook
+from app.simulation.plate_face import Colour, Face, PlateLook
 from app.simulation.plate_scene import PlacedFace, PlateScene, Sensor, Shadow
+from app.values import Floats32
 
 MARGIN = 0.08
 """[plate sides] of the sheet around the plate."""
@@ -167,10 +168,10 @@ class _Painter:
     def __init__(self, size: int, side_mm: float, stretch: float, ground: Colour) -> None:
         self._scale, self._middle = size / side_mm, size / 2
         self._stretch = 1 + stretch
-        self._face: FloatArray = np.empty((size, size, 3), np.float32)
+        self._face: Floats32 = np.empty((size, size, 3), np.float32)
         self._face[:] = ground
 
-    def face(self) -> FloatArray:
+    def face(self) -> Floats32:
         """Reflectance, shape (size, size, 3)."""
         return self._face
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from app.errors import InvalidParameter
 from app.radio.settings import check_between
-from app.simulation.radio.lanes import STEP_M, Floats, Origin, TrueLane, lane_between
+from app.simulation.radio.lanes import STEP_M, Origin, TrueLane, lane_between
+from app.values import Floats
 
 MICHIGAN: Origin = (-83.7, 42.3, 250.0)
 """Where the lanes lie: the CERPM paper's drives were in Michigan."""

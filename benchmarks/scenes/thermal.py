@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from app.markers.plate import PlateCode, PlateGeometry
 from app.simulation.camera import NO_SHADE, RenderedFrame, blurred, encode_jpeg, gather_faces, list_windows, pixel_rays
-from app.simulation.plate_face import Face, FloatArray, material_shares, smooth_noise
+from app.simulation.plate_face import Face, material_shares, smooth_noise
 from app.simulation.plate_scene import PlateScene, face_truth
+from app.values import Floats32
 
 Image = npt.NDArray[np.uint8]
 
@@ -120,7 +121,7 @@ def render_thermal_scene(
 
 def _road(
     shape: tuple[int, int], sensor: ThermalSensor, background: Image | None, rng: np.random.Generator
-) -> FloatArray:
+) -> Floats32:
     """Temperatures of the road relative to its mean. [K]"""
     field = smooth_noise(shape, shape[1] / 8, rng) - 0.5
     field = field + 0.5 * (smooth_noise(shape, 12, rng) - 0.5)
@@ -130,7 +131,7 @@ def _road(
     return np.asarray(field * (sensor.road_k / max(float(field.std()), 1e-6)), np.float32)
 
 
-def _grey(temperature: FloatArray, sensor: ThermalSensor, rng: np.random.Generator) -> Image:
+def _grey(temperature: Floats32, sensor: ThermalSensor, rng: np.random.Generator) -> Image:
     """Noise and the linear range of grey levels, the road's mean at a third of it."""
     noise = rng.standard_normal(temperature.shape, dtype=np.float32)
     stripes = 0.1 * rng.standard_normal((1, temperature.shape[1]), dtype=np.float32)

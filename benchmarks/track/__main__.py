@@ -13,8 +13,9 @@ from scipy.stats import chi2
 
 from app.tracks import ClockState, Track, TrackInput
 from app.tracks.estimate import estimate_track
+from app.values import Floats
 from benchmarks.track import drives
-from benchmarks.track.drives import Drive, Floats, simulate
+from benchmarks.track.drives import Drive, simulate
 from benchmarks.track.end_to_end import print_end_to_end
 
 _MEAN_SPEED_M_S = 12.4  # of the simulated drives

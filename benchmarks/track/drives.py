@@ -14,14 +14,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy import signal
 from scipy.ndimage import gaussian_filter1d
 
 from app.geodesy.frames import metres_per_radian
 from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 ROUTES = Path(__file__).parents[1] / "cerpm" / "routes"
 T0_S, STEP_S = 1_780_000_000.0, 0.05

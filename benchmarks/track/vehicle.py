@@ -18,7 +18,6 @@ from typing import Any
 import cv2
 import httpx
 import numpy as np
-import numpy.typing as npt
 
 from app.demo.cerpms import write_packets, write_poses
 from app.encoders.cerpm import encode_message
@@ -39,8 +38,7 @@ from app.simulation.plate_scene import PlacedFace, PlateScene
 from app.simulation.radio.drive import Drive, SatelliteReceiver, drive_past, observe_track
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_between
 from app.simulation.radio.link import Radio
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 LENGTH_M, HALF_WIDTH_M = 170.0, 1.75
 TAGS = (("SNS_4_0.1_10-30", 30.0), ("NNS_4_0.1_15-25", 85.0), ("SSN_4_0.1_30-10", 140.0))

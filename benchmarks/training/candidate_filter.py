@@ -29,13 +29,13 @@ from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, draw_daylight, draw_shadow, draw_stress
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import FaceTruth
+from app.values import Floats
 from benchmarks.plates.sets import Job, Shot, shoot
 from benchmarks.plates.tables import table
 from benchmarks.plates.views import read_photos
 from benchmarks.scenes.places import draw_place, scene_under
 
 Image = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float64]
 
 SHARES = (0.6, 0.2, 0.2)
 """[1] frames with plates of 8 x 8, 10 x 10 and 12 x 12 units."""

@@ -1,13 +1,15 @@
 """One word for a concept and one suffix for a unit, in columns, in values and in the names of stored JSON.
 
 What people decide about is approved or rejected, and has a status; what the server carries out has a state. Speeds end
-in m_s or kmh, accelerations in m_s2, curvatures in per_m. Entries of the audit log and versions of markers keep the
-names of their time: hashes cover them.
+in m_s or kmh, accelerations in m_s2, curvatures in per_m. The name of a recording's file is a member of its context, as
+that of a picture is, and what a drive's job needs to know of its decodes has the names of the request. Entries of the
+audit log and versions of markers keep the names of their time: hashes cover them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import sqlalchemy as sa
 from alembic import op
@@ -57,6 +59,10 @@ DOCUMENTS = {
     "vehicles": ("profile",),
 }
 
+RECORDINGS = ("trace", "packets")
+OF_DRIVES = {"decode_id": "id", "sigma_s": "clock_sigma_s"}
+CHUNK = 1000
+
 
 def upgrade() -> None:
     for table, columns in INDEXES:
@@ -70,9 +76,14 @@ def upgrade() -> None:
         columns = tuple("status" if name == "state" else name for name in columns)
         op.create_index(f"ix_{table}_{'_'.join(columns)}", table, list(columns), unique=False)
     _rename(NAMES)
+    _rewrite("decodes", "context", RECORDINGS, _lift_file_name)
+    _rewrite("jobs", "input", ("drive",), lambda _kind, document: _rename_decodes(document, OF_DRIVES))
 
 
 def downgrade() -> None:
+    former = {new: old for old, new in OF_DRIVES.items()}
+    _rewrite("jobs", "input", ("drive",), lambda _kind, document: _rename_decodes(document, former))
+    _rewrite("decodes", "context", RECORDINGS, _lower_file_name)
     _rename({new: old for old, new in NAMES.items()})
     for table, columns in INDEXES:
         op.drop_index(f"ix_{table}_{'_'.join(columns).replace('state', 'status')}", table)
@@ -135,3 +146,35 @@ def _rename(names: Mapping[str, str]) -> None:
                 changed = f"({changed})::json"
             found = " OR ".join(f"""{text} LIKE '%"{old}"%' """ for old in names)
             op.execute(sa.text(f"UPDATE {table} SET {column} = {changed} WHERE {found}"))
+
+
+def _rewrite(
+    table: str, column: str, kinds: tuple[str, ...], change: Callable[[str, dict[str, Any]], dict[str, Any]]
+) -> None:
+    """Change the documents of rows of some kinds, a part of the table after the other."""
+    connection, last = op.get_bind(), ""
+    rows = sa.table(table, sa.column("id"), sa.column("kind"), sa.column(column, sa.JSON))
+    of_kinds = sa.select(rows).where(rows.c.kind.in_(kinds)).order_by(rows.c.id).limit(CHUNK)
+    while found := connection.execute(of_kinds.where(rows.c.id > last)).mappings().all():
+        for row in found:
+            if (changed := change(row["kind"], row[column])) != row[column]:
+                connection.execute(sa.update(rows).where(rows.c.id == row["id"]).values({column: changed}))
+        last = found[-1]["id"]
+
+
+def _lift_file_name(kind: str, context: dict[str, Any]) -> dict[str, Any]:
+    part = dict(context.get(kind) or {})
+    name = part.pop("file_name", None)
+    return context if name is None else {**context, kind: part, "file_name": name}
+
+
+def _lower_file_name(kind: str, context: dict[str, Any]) -> dict[str, Any]:
+    above = {name: value for name, value in context.items() if name != "file_name"}
+    return (
+        {**above, kind: {**(context.get(kind) or {}), "file_name": context["file_name"]}} if above != context else above
+    )
+
+
+def _rename_decodes(job_input: dict[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    decodes = [{names.get(name, name): value for name, value in one.items()} for one in job_input.get("decodes", ())]
+    return {**job_input, "decodes": decodes} if decodes else job_input

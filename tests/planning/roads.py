@@ -6,7 +6,8 @@ import numpy as np
 from pyproj import Geod
 
 from app.formats.alignments.geometry import BoundaryStyle
-from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent
+from app.planning.alignment import Alignment, AvoidedArea, Lane, RoadEvent
+from app.values import Floats
 
 GEOD = Geod(ellps="WGS84")
 START_DEG = (8.4, 49.0)

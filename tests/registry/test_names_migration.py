@@ -21,7 +21,7 @@ AGENCY = "019cb624-0000-7000-8000-00000000aaaa"
 MARKER = "019cb624-0000-7000-8000-00000000bbbb"
 ITEM_STATES = ("open", "approved", "dismissed")
 REPORT_STATES = ("new", "accepted", "rejected")
-CONTEXT = {"packets": {"columns": {"speed_km_h": "limit"}}}
+CONTEXT = {"packets": {"file_name": "log.csv", "columns": {"speed_km_h": "limit"}}}
 RESULT = {"lane": {"speed_limits_km_h": [50], "path": {"curvature_1pm": [0.1], "note": "curvature_1pm"}}}
 NAMED = {"lane": {"speed_limits_kmh": [50], "path": {"curvature_per_m": [0.1], "note": "curvature_per_m"}}}
 _JSON = sa.JSON(none_as_null=True)
@@ -71,12 +71,14 @@ def _insert(connection: sa.Connection) -> None:
     ]  # fmt: skip
     decode = {"id": _id(9), "kind": "packets", "context": CONTEXT, "result": RESULT, **owned}
     job = {"id": _id(9), "kind": "decode", "state": "done", "input": CONTEXT, "progress": 1.0, **owned}
+    inputs = {"decodes": [{"decode_id": _id(9), "sigma_s": 0.5}]}
+    drive = {**job, "id": _id(8), "kind": "drive", "input": inputs}
     run = {"id": _id(0), "who": "w", "criteria": {}, "decodes": 1, "accepted_at": NOW, "accepted_by": "chief", **owned}
     contact = {"report_id": _id(1), "email": "a@example.org", **owned}
     rows: dict[str, list[dict[str, Any]]] = {
         "agencies": [{"id": AGENCY, "name": "one", "created_at": NOW}], "markers": [{"id": MARKER, **marker}],
         "maintenance_items": items, "damage_reports": reports, "damage_report_contacts": [contact],
-        "jobs": [job], "decodes": [decode], "reprocessings": [run],
+        "jobs": [job, drive], "decodes": [decode], "reprocessings": [run],
     }  # fmt: skip
     for name, values in rows.items():
         connection.execute(sa.insert(_like(name, values[0])), values)
@@ -91,9 +93,16 @@ def _rows(database: Database) -> dict[str, list[dict[str, Any]]]:
     names = ("maintenance_items", "damage_reports", "damage_report_contacts", "decodes", "jobs", "reprocessings")
     with database.read() as connection:
         return {
-            name: [dict(row) for row in connection.execute(sa.text(f"SELECT * FROM {name} ORDER BY 1, 2")).mappings()]
+            name: [
+                {column: _read(value) for column, value in row.items()}
+                for row in connection.execute(sa.text(f"SELECT * FROM {name} ORDER BY 1, 2")).mappings()
+            ]
             for name in names
         }
+
+
+def _read(value: object) -> object:
+    return orjson.loads(value) if isinstance(value, str) and value.startswith("{") else value
 
 
 def test_decisions_and_units_have_the_new_words(database: Database) -> None:
@@ -111,7 +120,11 @@ def test_decisions_and_units_have_the_new_words(database: Database) -> None:
             assert (row.report.status, row.report.item_id) == (status, _id(1) if k == 1 else None)
         assert get_report(connection, AGENCY, _id(1)).has_contact
         decode = get_decode(connection, AGENCY, _id(9))
-        assert (decode.context, decode.result) == ({"packets": {"columns": {"speed_kmh": "limit"}}}, NAMED)
+        assert decode.result == NAMED
+        assert decode.context == {"packets": {"columns": {"speed_kmh": "limit"}}, "file_name": "log.csv"}
+        drive = connection.execute(sa.text("SELECT input FROM jobs WHERE kind = 'drive'")).scalar_one()
+        named = drive if isinstance(drive, dict) else orjson.loads(drive)
+        assert named["decodes"] == [{"id": _id(9), "clock_sigma_s": 0.5}]
         approved = sa.text("SELECT approved_by FROM reprocessings")
         assert connection.execute(approved).scalar_one() == "chief"
 

@@ -12,7 +12,8 @@ import pytest
 from pyproj import Geod
 
 from app.errors import InvalidParameter
-from app.roads.axis import Axis, FloatArray, IntArray
+from app.roads.axis import Axis, IntArray
+from app.values import Floats
 
 GEOD = Geod(ellps="WGS84")
 LANES = sorted((Path(__file__).parents[2] / "benchmarks/cerpm/routes").glob("*.geojson"))
@@ -172,7 +173,7 @@ def test_a_place_beside_thousands_of_edges_has_the_nearest_twenty_feet(monkeypat
     exact: list[int] = []
     compute = Axis._exact
 
-    def count(self: Axis, places: IntArray, *rest: Any) -> tuple[FloatArray, FloatArray]:
+    def count(self: Axis, places: IntArray, *rest: Any) -> tuple[Floats, Floats]:
         exact.append(len(places))
         return compute(self, places, *rest)
 

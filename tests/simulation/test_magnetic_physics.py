@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from app.errors import InvalidParameter
@@ -24,8 +23,7 @@ from app.simulation.magnetic.spheroids import (
     spheroid_dipoles,
     spheroid_moment_am2,
 )
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 MU0_UT = 0.4 * math.pi  # [uT / (A/m)]
 NO_EARTH = np.zeros(3)

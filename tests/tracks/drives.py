@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 from scipy import signal
 
 from app.geodesy.frames import metres_per_radian
 from app.tracks import Clock, PositionFix, Samples, Track, TrackInput
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 T0_S = 1_760_000_000.0
 STEP_S = 0.02

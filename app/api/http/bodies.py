@@ -27,6 +27,7 @@ from app.formats.format import SpooledFile
 from app.formats.json_text import parse_json
 from app.services.idempotency import IdempotencyKey
 from app.storage.spool import Spool, SpoolWriter
+from app.values import JsonObject
 
 # === Turns of bodies: of many that arrive at once, a few go on in each round of the event loop.
 
@@ -318,9 +319,7 @@ def idempotency_of(request: Request, header: str | None, text: bytes, *files: Sp
     return IdempotencyKey(key, digest.hexdigest(), caller_of(request).key_id)
 
 
-def form_body(
-    parts: dict[str, Any], declared_in: str, declaration: type, example: object, **others: object
-) -> dict[str, Any]:
+def form_body(parts: JsonObject, declared_in: str, declaration: type, example: object, **others: object) -> JsonObject:
     """OpenAPI description of a body that is a form: its first part is required, and one part is a declaration in JSON.
 
     Parameters

@@ -20,6 +20,7 @@ from fastapi.routing import APIRoute
 from app.api.http.middleware import is_protected
 from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
 from app.api.http.problems import MEDIA_TYPE, Mode, component_schemas
+from app.values import JsonObject
 
 _RESPONSES = "#/components/responses/"
 STORED = Path(__file__).with_name("data") / "openapi.json"
@@ -71,7 +72,7 @@ def operation_id(route: APIRoute) -> str:
 def describe(app: FastAPI) -> None:
     """Replace the app's OpenAPI document by one with keys and problems."""
 
-    def openapi() -> dict[str, Any]:
+    def openapi() -> JsonObject:
         if app.openapi_schema is None:
             document = get_openapi(
                 title=app.title, version=app.version, description=DESCRIPTION, routes=app.routes, license_info=_LICENSE,
@@ -102,7 +103,7 @@ def _models_of(app: FastAPI) -> Iterator[tuple[Any, Mode]]:
             yield from ((field.field_info.annotation, "serialization") for field in route.response_fields.values())
 
 
-def stored_text(document: dict[str, Any]) -> str:
+def stored_text(document: JsonObject) -> str:
     """The document as it is stored: each value on a line, for readable differences between versions."""
     return json.dumps(document, ensure_ascii=False, indent=0, separators=(",", ":")) + "\n"
 
@@ -110,7 +111,7 @@ def stored_text(document: dict[str, Any]) -> str:
 _LICENSE = {"name": "Apache-2.0", "identifier": "Apache-2.0"}
 
 
-def _share_problems(document: dict[str, Any]) -> dict[str, Any]:
+def _share_problems(document: JsonObject) -> JsonObject:
     """Move the problem responses that several operations have out of them; they refer to them by name.
 
     The name is `Problem` and the status; `ProblemOrPage` where browsers get a page instead.
@@ -132,7 +133,7 @@ def _share_problems(document: dict[str, Any]) -> dict[str, Any]:
     return dict(sorted(shared.items()))
 
 
-def _require_defaults(document: dict[str, Any]) -> None:
+def _require_defaults(document: JsonObject) -> None:
     """A member with a default is always part of a response; clients may leave it out of requests only."""
     schemas = document["components"]["schemas"]
     operations = (operation for path in document["paths"].values() for operation in path.values())
@@ -157,14 +158,14 @@ def _names_in(part: object) -> list[str]:
     return re.findall(r'"#/components/schemas/([^"]+)"', json.dumps(part))
 
 
-def _require_keys(document: dict[str, Any]) -> None:
+def _require_keys(document: JsonObject) -> None:
     for path, operations in document["paths"].items():
         if is_protected(path):
             for operation in operations.values():
                 operation["security"] = SECURITY
 
 
-def _describe_headers(document: dict[str, Any]) -> None:
+def _describe_headers(document: JsonObject) -> None:
     """Headers are absent or texts, never null; clients must send If-Match where a route returns 428 without it."""
     for operations in document["paths"].values():
         for operation in operations.values():

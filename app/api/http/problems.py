@@ -20,6 +20,7 @@ from app.api.public_pages.html import as_page
 from app.encoders.magnet import CodebookFull
 from app.inputs import input_error
 from app.services.documents import ErrorCause, cut_text, error_cause
+from app.values import JsonObject
 
 # === Schemas of the OpenAPI document that FastAPI does not find by itself: parts of forms, and problem documents.
 
@@ -35,7 +36,7 @@ def reference(model: type, mode: Mode = "validation") -> dict[str, str]:
     return {"$ref": _TEMPLATE.format(model=model.__name__)}
 
 
-def with_reference(response: dict[str, Any]) -> dict[str, Any]:
+def with_reference(response: JsonObject) -> JsonObject:
     """A response of a route whose `model`, if it is a class, is a reference: FastAPI would make its schema at once."""
     if not isinstance(response.get("model"), type):
         return response
@@ -44,19 +45,19 @@ def with_reference(response: dict[str, Any]) -> dict[str, Any]:
     return {**described, "content": {**described.get("content", {}), "application/json": {"schema": schema}}}
 
 
-def component_schemas(others: Iterable[tuple[Any, Mode]] = ()) -> dict[str, Any]:
+def component_schemas(others: Iterable[tuple[Any, Mode]] = ()) -> JsonObject:
     """The schemas of all models that are referred to, of others, and of the models within them, by name."""
     models = (*_MODELS.values(), *others)
     adapters = [(number, mode, TypeAdapter(model)) for number, (model, mode) in enumerate(models)]
     _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE)
-    found: dict[str, Any] = schemas["$defs"]
+    found: JsonObject = schemas["$defs"]
     return found
 
 
 # === Every error that a client can cause, as an RFC 9457 problem document from one table.
 
 
-Described = dict[int | str, dict[str, Any]]
+Described = dict[int | str, JsonObject]
 """What FastAPI's argument `responses` takes: status to description."""
 MEDIA_TYPE = "application/problem+json"
 MAX_ERRORS = 20

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 import orjson
 from fastapi import Header, Request, Response
@@ -15,9 +15,10 @@ from fastapi import Header, Request, Response
 from app.api.http.problems import Described, problem_responses
 from app.errors import InvalidParameter
 from app.inputs import Time as Time
+from app.values import JsonObject
 
 BINARY: dict[str, str] = {"type": "string", "format": "binary"}
-GEOJSON: dict[str, Any] = {
+GEOJSON: JsonObject = {
     "type": "object",
     "description": "A GeoJSON FeatureCollection (RFC 7946).",
     "required": ["type", "features"],
@@ -69,7 +70,7 @@ def file_response(
 ) -> Described:
     """A response that is a file of one of some media types: binary, or GeoJSON; with descriptions of its headers."""
     content = {media_type: {"schema": _SCHEMAS.get(media_type, BINARY)} for media_type in media_types}
-    described: dict[str, Any] = {"description": description, "content": content}
+    described: JsonObject = {"description": description, "content": content}
     if headers:
         described["headers"] = {
             name: {"description": text, "schema": {"type": "string"}} for name, text in headers.items()

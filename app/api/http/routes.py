@@ -20,6 +20,7 @@ from app.api.http.permissions import PUBLIC, Allowed
 from app.api.http.problems import Described, with_reference
 from app.api.http.strict_json import in_thread_if_large, read_body
 from app.errors import UnsupportedUpload
+from app.values import JsonObject
 
 EndpointT = TypeVar("EndpointT", bound=Callable[..., Any])
 _BUILD = RLock()
@@ -33,7 +34,7 @@ class RouteOptions(TypedDict, total=False):
     status_code: int
     responses: Described
     response_class: type[Response]
-    openapi_extra: dict[str, Any]
+    openapi_extra: JsonObject
     include_in_schema: bool
     name: str
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cache
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, FailFast, Field, TypeAdapter, ValidationError
@@ -17,6 +17,7 @@ from pydantic_core import ErrorDetails
 from app.api.http.dependencies import Number
 from app.formats.json_text import parse_json
 from app.services.request_work import counted
+from app.values import JsonObject
 
 T = TypeVar("T")
 _UNKNOWN = "extra_forbidden"
@@ -65,9 +66,9 @@ def validated(adapter: TypeAdapter[T], value: object, *where: str) -> T:
         raise RequestValidationError([_located(fault, where, names) for fault in faults]) from None
 
 
-def _located(fault: ErrorDetails, where: tuple[str, ...], names: Collection[str]) -> dict[str, Any]:
+def _located(fault: ErrorDetails, where: tuple[str, ...], names: Collection[str]) -> JsonObject:
     """A fault with its place in the request, and with the known name that is nearest to an unknown one."""
-    found: dict[str, Any] = {**fault, "loc": (*where, *fault["loc"])}
+    found: JsonObject = {**fault, "loc": (*where, *fault["loc"])}
     if fault["type"] == _UNKNOWN:
         unknown = str(fault["loc"][-1])[:80].lower()
         longer = sorted((name for name in names if name.startswith(f"{unknown}_")), key=len)

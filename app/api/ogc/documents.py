@@ -30,7 +30,6 @@ from app.api.ogc.responses import (
     Conformance,
     ExtentDocument,
     FeaturesService,
-    JsonObject,
     LandingPage,
     Offers,
     answer,
@@ -40,6 +39,7 @@ from app.api.ogc.responses import (
 from app.api.ogc.tiles import TILES_REL
 from app.registry.features import Extent, Field
 from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection, FeatureCrs
+from app.values import JsonObject
 
 # === JSON Schemas of a collection's features: as OGC API Common part 3 (OGC 23-058r2, formerly Features part 5)
 # describes

@@ -43,6 +43,7 @@ from app.services.markers.features import STORAGE_CRS, Collection, FeatureCrs
 from app.services.markers.features import Features as FeaturesUseCases
 from app.services.markers.markers import Markers as MarkersUseCases
 from app.services.markers.plausibility import WarningMode
+from app.values import JsonObject
 
 _PLAIN = ("status", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m", "side")
 _CLEARED = ("heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")  # by a PUT without them
@@ -90,7 +91,7 @@ async def get_edit(
     return _Edit(collection, caller, features, markers, FeatureCrs(sent), warnings)
 
 
-async def get_body(request: Request) -> dict[str, Any]:
+async def get_body(request: Request) -> JsonObject:
     """The feature in the body.
 
     Raises
@@ -113,7 +114,7 @@ async def get_body(request: Request) -> dict[str, Any]:
 
 
 Edit = Annotated[_Edit, Depends(get_edit)]
-Body = Annotated[dict[str, Any], Depends(get_body)]
+Body = Annotated[JsonObject, Depends(get_body)]
 
 
 @router.options("", READERS, responses=problem_responses(404))
@@ -198,7 +199,7 @@ def delete_feature(edit: Edit, feature_id: FeatureId, version: SentVersion) -> R
     return Response(status_code=204)
 
 
-def _change(feature: dict[str, Any], edit: _Edit, feature_id: str, version: int | None) -> Response:
+def _change(feature: JsonObject, edit: _Edit, feature_id: str, version: int | None) -> Response:
     stored = edit.features.get(edit.caller, edit.collection, feature_id)
     if version not in (None, stored["properties"]["version"]):  # also where there is nothing to change
         raise StaleVersion(f"marker {feature_id} is no longer at version {version}", field="If-Match")
@@ -247,7 +248,7 @@ def _members_of_others(family: str) -> set[str]:
     return {name for other in FAMILIES if other.name != family and other.change for name in other.change.model_fields}
 
 
-def _properties(feature: dict[str, Any]) -> dict[str, Any]:
+def _properties(feature: JsonObject) -> JsonObject:
     given = feature.get("properties", {})
     if given is None:
         return {}
@@ -264,7 +265,7 @@ def _properties(feature: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _position(place: dict[str, Any], surveyed: dict[str, Any]) -> dict[str, Any]:
+def _position(place: JsonObject, surveyed: JsonObject) -> JsonObject:
     """A point with its properties. The height of a geometry is ellipsoidal; another is in the properties."""
     if "height_m" not in place:
         return place | surveyed
@@ -278,7 +279,7 @@ def _position(place: dict[str, Any], surveyed: dict[str, Any]) -> dict[str, Any]
     )
 
 
-def _place(geometry: Any, crs: FeatureCrs) -> dict[str, Any]:
+def _place(geometry: Any, crs: FeatureCrs) -> JsonObject:
     spot = geometry.get("coordinates") if isinstance(geometry, dict) and geometry.get("type") == "Point" else None
     if (
         not isinstance(spot, list)
@@ -287,5 +288,5 @@ def _place(geometry: Any, crs: FeatureCrs) -> dict[str, Any]:
     ):
         raise InvalidParameter("the geometry is not a point", field="geometry", limit="Point with two or three numbers")
     lon_deg, lat_deg = crs.to_lon_lat(float(spot[0]), float(spot[1]))
-    place: dict[str, Any] = {"lon_deg": lon_deg, "lat_deg": lat_deg}
+    place: JsonObject = {"lon_deg": lon_deg, "lat_deg": lat_deg}
     return place if len(spot) == 2 else {**place, "height_m": float(spot[2])}

@@ -17,7 +17,7 @@ from urllib.parse import urlencode
 import orjson
 from fastapi import Depends, Path
 from fastapi import Request as FastapiRequest
-from pydantic import ConfigDict, JsonValue, with_config
+from pydantic import ConfigDict, with_config
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
@@ -40,12 +40,12 @@ from app.api.ogc.query import (
 from app.errors import InvalidParameter
 from app.services.markers.features import Collection, FeatureCrs, Features, get_collection, no_feature
 from app.services.request_work import counted
+from app.values import JsonObject
 
 # === What the API returns under /ogc, typed (OGC 17-069r4, 18-058r1, 20-057; GeoJSON: RFC 7946).
 
 
 Asked = ParamSpec("Asked")
-JsonObject = dict[str, JsonValue]
 
 
 class Link(TypedDict):

@@ -23,7 +23,6 @@ from app.api.ogc.responses import (
     BaseUrl,
     CollectionOf,
     FeaturesService,
-    JsonObject,
     Offers,
     TileMatrix,
     TileMatrixSet,
@@ -42,6 +41,7 @@ from app.plots.map_symbols import LOOKS, symbol_name
 from app.registry.features import Extent
 from app.registry.tiles import MAX_ZOOM, Tile
 from app.services.markers.features import MAINTENANCE_ITEMS, PLANS, Collection, FeatureCrs
+from app.values import JsonObject
 
 # === Tilesets for map libraries and QGIS: TileJSON 3.0, and a MapLibre style whose symbols show family and status.
 

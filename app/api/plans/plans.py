@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 import orjson
 from fastapi import Path, Query, Request, Response
@@ -60,6 +60,7 @@ from app.services.plans.packages import Packages
 from app.services.plans.plans import Plans
 from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, Proofs
 from app.services.progress import JobDocument, PackageJob, PlanJob, ProofJob
+from app.values import JsonObject
 
 # === Bodies of requests: rules are a document as docs/plans.md describes it.
 
@@ -142,7 +143,7 @@ class ProofIn(ProofTerms):
 rule_router = Router("/v1", "plans")
 
 SCHEMA_TYPE = "application/schema+json"
-_SCHEMA: dict[int | str, dict[str, Any]] = {
+_SCHEMA: dict[int | str, JsonObject] = {
     200: {"description": "JSON Schema, draft 2020-12", "content": {SCHEMA_TYPE: {"schema": {"type": "object"}}}}
 }
 

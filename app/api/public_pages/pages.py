@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 from anyio import to_thread
 from fastapi import Depends, Path, Query, Request, Response
@@ -43,6 +43,7 @@ from app.services.public_pages.pages import (
 )
 from app.services.public_pages.pages import ReportForm as ReportFormDocument
 from app.services.public_pages.reports import DamageReports
+from app.values import JsonObject
 
 router = Router("/m", "public pages")
 
@@ -82,12 +83,12 @@ Tokens = Annotated[FormTokens, use_case(lambda cases: cases.form_tokens)]
 Limits = Annotated[PublicLimits, Depends(get_public_limits)]
 Form = Annotated[FormLimits, Depends(get_form_limits)]
 
-_HTML: dict[str, Any] = {"text/html": {"schema": {"type": "string"}}}
+_HTML: JsonObject = {"text/html": {"schema": {"type": "string"}}}
 
 
-def _described(status: int, description: str, model: type | None = None) -> dict[int | str, dict[str, Any]]:
+def _described(status: int, description: str, model: type | None = None) -> dict[int | str, JsonObject]:
     """A page that is HTML, or JSON if there is a model; every problem is HTML or JSON."""
-    page: dict[str, Any] = {"description": description, "content": _HTML}
+    page: JsonObject = {"description": description, "content": _HTML}
     if model is not None:
         page["model"] = model
     problems = problem_responses(404, 405)
@@ -250,7 +251,7 @@ def _as_error(fault: Fault, form: FormLimits) -> InvalidParameter:
 
 def _document(marker: PublicMarker, token: str | None) -> PublicMarkerDocument:
     names = ("code", "agency", "status", "revision", "road", "measure_m")
-    shown: dict[str, Any] = {name: value for name in names if (value := getattr(marker, name)) is not None}
+    shown: JsonObject = {name: value for name in names if (value := getattr(marker, name)) is not None}
     report: ReportFormDocument | None = None
     if token is not None:
         report = {

@@ -25,11 +25,10 @@ from app.geodesy import LocalizationGrade, grade_accuracy
 from app.geodesy.frames import metres_per_radian
 from app.markers.cerpm import MAX_INVALID_TAGS_PER_LOG, MESSAGE_BYTES, CerpmMessage, LaneSide
 from app.sensors.pose_track import PlainClaim, PoseTrack, ReceivedPacket
+from app.values import Floats
 
 # === Positions of the vehicle at given times, and distances from them.
 
-
-Floats = npt.NDArray[np.float64]
 
 MAX_GAP_S = 5.0  # [s] between poses further apart the position is unknown; 100 m at 72 km/h
 

@@ -28,8 +28,7 @@ from app.radio.link import (
     residual_correlation,
 )
 from app.sensors.pose_track import PoseTrack
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 ANTENNA_M = 1.5  # [m] of the receiver above the road if unknown; the roof of a car
 MIN_FLEET = 5  # markers with a profile to compare a marker with

@@ -32,6 +32,7 @@ from app.markers.cerpm import (
     message_tag,
 )
 from app.sensors.pose_track import ReceivedPacket
+from app.values import Floats
 
 # === The 24 bytes of a CERPM to its message, and the check of its tag.
 
@@ -148,9 +149,6 @@ def _damaged(message: str, field: str, limit: str) -> InvalidParameter:
 # A marker counts its transmissions, so a message of sequence s was made before every message of a higher sequence, by
 # at least the shortest interval for each step between them. If the higher one was received at t, the lower one was made
 # before t; received later than that, it was recorded and sent again. This holds whoever sent it.
-
-
-Floats = npt.NDArray[np.float64]
 
 
 FASTEST_INTERVAL_S = 0.014  # [s] source: below the 15.4 ms on air of 24 bytes at SF7, 500 kHz (`radio.settings`)

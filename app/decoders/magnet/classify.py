@@ -9,13 +9,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from app.decoders.magnet.dipole_fit import UPRIGHT, MagnetPrior
 from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole, magnet_prior
 from app.decoders.magnet.identify import Identification, TagCandidates
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseKind, PlacedMagnet, Side, TagReading
 from app.markers.magnet import MAX_LINE_SPACING_M, LineStyle, LineTag, Orientation, Polarity
+from app.values import Floats
 
 # === Poles of iron among fitted dipoles: iron seldom has one pole, and its poles do not stand in a row.
 
@@ -67,8 +67,6 @@ def is_ferrous(dipoles: Sequence[Dipole], half_width_m: float) -> bool:
 #
 # Shapes: C clearances, M moments, I shares of iron.
 
-
-Floats = npt.NDArray[np.float64]
 
 CLEARANCES_M = np.arange(0.08, 0.651, 0.01)
 """Clearances of the grid. [m] Source: bars below bumpers, 15 to 35 cm (METRO section 7.3), trucks 40 cm, and room."""

@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from app.decoders.magnet.classify import is_ferrous
 from app.decoders.magnet.dipole_fit import FORWARD, PARAMETERS, UPRIGHT, MagnetPrior, add_dipole_field
 from app.decoders.magnet.fit_window import SURE_MARGIN, Dipole, FitWindow, Region, SensorArray
 from app.decoders.magnet.matched_filter import BIN_M, HALF_BINS, THRESHOLD, BinScores, FilterBank, score_bins
 from app.decoders.magnet.preprocess import Blocks
+from app.values import Floats, Floats32
 
 # === Second looks at the dipoles of a region, whose fields merge where the bar is high above them.
 #
@@ -24,8 +24,6 @@ from app.decoders.magnet.preprocess import Blocks
 # as three; a magnet abreast of one of a line as one of the other kind. Dipoles that are hardly magnets are replaced by
 # one or two magnets where these are likelier.
 
-
-Floats = npt.NDArray[np.float64]
 
 CLUSTER_M = 1.2
 """Largest distance in a cluster, whose fields overlap. [m]"""
@@ -234,8 +232,6 @@ def apart_m(one: Floats, other: Floats) -> float:
 
 # === Detection of the dipoles of a region.
 
-
-Floats32 = npt.NDArray[np.float32]
 
 STOP_SHARE = 0.015
 """Share of the strongest candidate's statistic below which the pursuit ends: what a model that errs by some percent

@@ -10,11 +10,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from app.compiled import ieee_kernel, ieee_routine, kernel, routine
 from app.decoders.magnet.matched_filter import BIN_M
 from app.markers.magnet import FIELD_UT_M3
+from app.values import Floats, Floats32, Ints
 
 # === The field of dipoles in the samples of a bar, whitened, and the background that is projected out of data and
 # model.
@@ -25,9 +25,6 @@ from app.markers.magnet import FIELD_UT_M3
 #
 # Shapes: S array sensors, K blocks, Q background functions, axes x, y, z of the vehicle.
 
-
-Floats = npt.NDArray[np.float64]
-Floats32 = npt.NDArray[np.float32]
 
 PARAMETERS = 6
 """Parameters of a dipole: s, y, h [m] and the moment's x, y, z [A m2]. Source: definition of a point dipole."""
@@ -216,8 +213,6 @@ def add_dipole_field(
 
 # === Least-squares fit of dipoles to the blocks of a trace, neighbours whose fields overlap fitted together.
 
-
-Integers = npt.NDArray[np.int64]
 
 UPRIGHT, FORWARD = 2, 0
 """Kind of a magnet: the axis of the vehicle along which its moment points."""
@@ -454,7 +449,7 @@ def _solve(matrix: Floats, damping: float, rhs: Floats, out: Floats) -> None:
 
 
 @routine
-def _linearize(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitData, work: _Work) -> float:
+def _linearize(dipoles: Floats, kinds: Ints, prior: MagnetPrior, data: FitData, work: _Work) -> float:
     """Normal equations at the dipoles with the prior; returns the cost there."""
     _set_residual(dipoles, data, work)
     _set_row_weights(data, work)
@@ -468,7 +463,7 @@ def _linearize(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitDa
 
 
 @routine
-def _solve_moments(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitData, work: _Work) -> None:
+def _solve_moments(dipoles: Floats, kinds: Ints, prior: MagnetPrior, data: FitData, work: _Work) -> None:
     """Moments by linear least squares, the places as they are; in place."""
     _set_residual(dipoles, data, work)
     _set_jacobian(dipoles, data, work)
@@ -496,7 +491,7 @@ def _solve_moments(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: F
 
 @routine
 def _take_step(
-    dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitData, work: _Work, cost: float, damping: float
+    dipoles: Floats, kinds: Ints, prior: MagnetPrior, data: FitData, work: _Work, cost: float, damping: float
 ) -> tuple[float, float]:
     """Move the dipoles by the first damped step that lowers the cost; returns the next damping and the gain."""
     n = dipoles.shape[0]
@@ -526,7 +521,7 @@ def _take_step(
 
 
 @ieee_kernel
-def fit_dipoles(data: FitData, start: Floats, kinds: Integers, prior: MagnetPrior) -> FittedDipoles:
+def fit_dipoles(data: FitData, start: Floats, kinds: Ints, prior: MagnetPrior) -> FittedDipoles:
     """Fit n dipoles together.
 
     Parameters

@@ -21,8 +21,7 @@ from app.decoders.magnet.dipole_fit import (
 )
 from app.decoders.magnet.matched_filter import DISTANCES_M, BinScores
 from app.decoders.magnet.preprocess import Blocks
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 TILT_SPREAD = 0.10
 """Standard deviation of a moment's components across its axis, share of it: 6 degrees. Source: 3 degrees between

@@ -26,6 +26,7 @@ from app.markers.magnet import InformationTag, Polarity, check_magnet_count, seg
 from app.markers.magnet_design import Meaning
 from app.markers.reading import Matrix
 from app.sensors.magnetometer_bar import MagnetometerBar
+from app.values import Floats
 
 # === What matching and localization need to know of a registered information tag.
 
@@ -54,8 +55,6 @@ class RegisteredTag:
 
 # === Identification.
 
-
-Floats = npt.NDArray[np.float64]
 
 _MAX_SCALE_ERROR = 0.04  # share by which the odometer may be off; several times a wheel's wear
 _MAX_LENGTH_ERROR_M = 0.10  # [m] more that a distance may be off

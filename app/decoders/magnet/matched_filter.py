@@ -20,10 +20,8 @@ import numpy.typing as npt
 
 from app.compiled import ieee_routine, kernel, routine
 from app.markers.magnet import FIELD_UT_M3
+from app.values import Floats, Floats32, Ints
 
-Floats = npt.NDArray[np.float64]
-Floats32 = npt.NDArray[np.float32]
-Integers = npt.NDArray[np.int64]
 Counts = npt.NDArray[np.int32]
 
 BIN_M = 0.05
@@ -72,7 +70,7 @@ class FilterBank(NamedTuple):
     # shape (3, nD, HALF_BINS + 1): a, E0 (even) and E1 (odd), offset or slope removed, for dx >= 0. [uT / (A m2) times
     # powers of m]
     kernels: Floats32
-    taps: Integers  # shape (nD,): bins on each side that each D uses
+    taps: Ints  # shape (nD,): bins on each side that each D uses
     # shape (nD, 2): squared filters of a channel for which the moment is along the axis, even (2 A - 3 D2 E0) and odd
     # (E1)
     energy: Floats32
@@ -80,8 +78,8 @@ class FilterBank(NamedTuple):
     # `lateral_m`, `height_m`: shape (P,): [m] counts: positions on the bar and clearances
     lateral_m: Floats
     height_m: Floats
-    first: Integers  # shape (P + 1,): where the rows of each cell begin in the arrays below
-    site: Integers  # shape (R,): index of D times S, plus the array sensor, of each row
+    first: Ints  # shape (P + 1,): where the rows of each cell begin in the arrays below
+    site: Ints  # shape (R,): index of D times S, plus the array sensor, of each row
     # shape (R, SITE_SUMS): what each sum of `_sum_sites` contributes to the filters: the field is that of the kernel's
     # D times a scale
     share: Floats32
@@ -94,7 +92,7 @@ class BinScores(NamedTuple):
     # shape (N, 2): largest matched-filter statistic over the cells: chi-squared with one degree of freedom without a
     # magnet
     statistic: Floats32
-    cell: Integers  # shape (N, 2): its cell in the bank
+    cell: Ints  # shape (N, 2): its cell in the bank
 
     @classmethod
     def empty(cls, count: int) -> BinScores:
@@ -156,7 +154,7 @@ def make_filter_bank(positions_m: Floats) -> FilterBank:
     )  # fmt: skip
 
 
-def _make_kernels() -> tuple[Floats, Integers, Floats]:
+def _make_kernels() -> tuple[Floats, Ints, Floats]:
     """Kernels and taps of a `FilterBank`, and the inner products <A, A>, <A, E0>, <E0, E0>, <E1, E1> (nD, 4)."""
     kernels = np.zeros((3, DISTANCES_M.size, HALF_BINS + 1))
     taps = np.minimum(np.ceil((KERNEL_HEIGHTS * DISTANCES_M + KERNEL_M) / BIN_M).astype(np.int64), HALF_BINS)
@@ -281,7 +279,7 @@ def _sum_squared(p: _Projection, bins: int, bank: FilterBank) -> None:
 
 
 @routine
-def _score(p: _Projection, bins: int, sensors: int, bank: FilterBank, statistic: Floats32, cells: Integers) -> None:
+def _score(p: _Projection, bins: int, sensors: int, bank: FilterBank, statistic: Floats32, cells: Ints) -> None:
     """Largest statistic b2 / g over the cells and its cell, for forward (0) and upright (1) magnets at each bin.
 
     b sums filter times channel over noise variance, g the squared filters over the variance.
@@ -358,7 +356,7 @@ def score_bins(x: Floats32, start: int, bank: FilterBank, variance: Floats32, sc
 
 
 @kernel
-def scan_bins(x: Floats32, start: int, bank: FilterBank, variance: Floats32, state: Integers, scores: BinScores) -> int:
+def scan_bins(x: Floats32, start: int, bank: FilterBank, variance: Floats32, state: Ints, scores: BinScores) -> int:
     """Score bins and track the noise until a region is complete; returns the number of bins scored.
 
     variance (nD, 3) and state (4,), see `BINS_SEEN`, are carried on. A region is complete after REGION_END_BINS below

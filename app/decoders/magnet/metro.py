@@ -13,11 +13,11 @@ from app.compiled import ieee_kernel
 from app.decoders.magnet.readings import Finding, LineCrossing, MagnetReading, Side, TagReading
 from app.markers.magnet import LineTag, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+from app.values import Floats
 
 # === The steps of the METRO paper's pipeline (section 5), one function each.
 
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 MPH = 0.44704

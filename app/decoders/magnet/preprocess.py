@@ -17,10 +17,7 @@ from app.decoders.magnet.matched_filter import BIN_M
 from app.decoders.magnet.readings import NoiseFinding, NoiseKind
 from app.errors import InvalidParameter
 from app.sensors.magnetometer_bar import MAX_FIELD_UT, MagnetometerBar, MagnetTrace, SensorRole
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+from app.values import Bools, Floats, Floats32, Ints
 
 BLOCK_M = 0.02
 """Samples nearer to each other than this are averaged. [m] Less than half a bin
@@ -243,7 +240,7 @@ class _Repair(NamedTuple):
     raw: Floats  # (S, 3) the sample before, as read
     last: Floats  # (S, 3) the sample before, repaired
     earlier: Floats  # (S, 3) the one before that, repaired
-    neighbours: Integers  # (S, 2) nearest array sensors, -1 for none
+    neighbours: Ints  # (S, 2) nearest array sensors, -1 for none
 
 
 class _Check(NamedTuple):
@@ -251,8 +248,8 @@ class _Check(NamedTuple):
 
     predicted: Floats  # (S, 3) on the line through the last repaired and the next usable sample [uT]
     deviation: Floats  # (S,) distance from it, 0 where the sample or the next one is unusable [uT]
-    usable: Flags  # (S,) in range and no repeat
-    next_usable: Flags  # (S,)
+    usable: Bools  # (S,) in range and no repeat
+    next_usable: Bools  # (S,)
 
 
 class _OpenBlock(NamedTuple):
@@ -384,8 +381,6 @@ def _repair_and_average(raw: Floats, drive: Floats, repair: _Repair, block: _Ope
 # === Blocks resampled to bins of equal length along the road, the common mode of all sensors removed.
 
 
-Floats32 = npt.NDArray[np.float32]
-
 LAG_BINS = 8
 """Bins on each side of the second difference (the bend) by which noise is measured: 40 cm. Longer than a magnet's pulse
 at METRO's clearance."""
@@ -434,7 +429,7 @@ class FieldBins:
 
     def __init__(self, positions_m: Floats) -> None:
         sensors = len(positions_m)
-        self.shift: Integers = np.round((positions_m[:, 0] - positions_m[:, 0].min()) / BIN_M).astype(np.int64)
+        self.shift: Ints = np.round((positions_m[:, 0] - positions_m[:, 0].min()) / BIN_M).astype(np.int64)
         self.start = 0
         self.ready = 0
         self._bins = _empty_bins(int(self.shift.max()) + 1, sensors)
@@ -529,7 +524,7 @@ def _track_noise(axis: int, noise: _Noise) -> float:
 
 
 @ieee_routine
-def _write_bin(at: int, value: Floats, shift: Integers, bins: _Bins, noise: _Noise) -> None:
+def _write_bin(at: int, value: Floats, shift: Ints, bins: _Bins, noise: _Noise) -> None:
     """Write one bin (A, 3), its common mode removed; sensors further ahead go into later bins."""
     sensors = value.shape[0]
     for k in range(noise.recent.shape[0] - 1):
@@ -581,7 +576,7 @@ def _set_value(s: float, block: Floats, opened: _OpenBin, value: Floats) -> None
 
 @ieee_kernel
 def _bin_blocks(
-    s: Floats, blocks: Floats, shift: Integers, start: int, bins: _Bins, noise: _Noise, opened: _OpenBin
+    s: Floats, blocks: Floats, shift: Ints, start: int, bins: _Bins, noise: _Noise, opened: _OpenBin
 ) -> int:
     """Fill bins from blocks (N, A, 3) at s (N,); `bins` begin at the number `start`. Returns the open bin's number."""
     sensors = blocks.shape[1]

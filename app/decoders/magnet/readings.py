@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
+from app.values import Floats
 
 
 class Side(StrEnum):
@@ -111,9 +112,6 @@ Finding = MagnetReading | LineCrossing | TagReading | NoiseFinding
 
 
 # === Where magnets lie on the plane: speed integrated along the heading, and the place on the bar (equation 1).
-
-
-Floats = npt.NDArray[np.float64]
 
 
 class VehiclePath:

@@ -13,15 +13,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from app.decoders.magnet.decoder import decode_trace
 from app.decoders.magnet.identify import TagCandidates
 from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding, NoiseKind
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 SURE_CONFIDENCE = 0.99
 """[probability] of a magnet that counts."""

@@ -17,9 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.compiled import kernel, routine
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
+from app.values import Floats, Ints
 
 # Distances over which the filter learns, in turns of some two metres, and limits of what a wheel can be like. They were
 # chosen where no measurement stands beside them. `python -m benchmarks.magnets wheel drawn` checks them: the passes of
@@ -110,7 +108,7 @@ class _Trials(NamedTuple):
 class _Turns(NamedTuple):
     """The rotation of the wheels, as the references see it."""
 
-    references: Integers  # (W,) reference sensors
+    references: Ints  # (W,) reference sensors
     left_m: Floats  # (W,) of the middle of the vehicle
     rolled_m: Floats  # (W,) so far
     lengths_m: Floats  # (L,) trial lengths
@@ -142,7 +140,7 @@ class _Limits(NamedTuple):
 
     loudness: Floats  # (S,) strength over the loudest reference's
     rise: Floats  # (S,) strength over the sum of those at the sensors beside
-    beside: Integers  # (S, 2) these sensors, -1 where a wheel may be as loud
+    beside: Ints  # (S, 2) these sensors, -1 where a wheel may be as loud
 
 
 class WheelNoiseCanceller:

@@ -27,6 +27,7 @@ from app.markers.plate import (
     position_decimals,
     reed_solomon_words,
 )
+from app.values import Floats
 
 # === The likeliest Reed-Solomon codeword of a plate, and the probability that it is wrong.
 #
@@ -40,7 +41,6 @@ from app.markers.plate import (
 # Trans. Inf. Theory 41 (1995), here of order 2 and over GF(16).
 
 
-Floats = npt.NDArray[np.float64]
 Symbols = npt.NDArray[np.uint8]
 
 

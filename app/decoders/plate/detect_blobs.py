@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from app.compiled import ieee_kernel, ieee_loop, ieee_loop_kernel, kernel, step, trailing_zeros
 from app.decoders.plate import Array
+from app.values import Floats
 
 # === Signals of red and green in a frame, at half resolution and coarser.
 #
@@ -195,7 +196,6 @@ def _thresholds(rough: npt.NDArray[np.int32]) -> Signal:
 # === Connected blobs of red and of green in a signal, with their moments.
 
 
-Floats = npt.NDArray[np.float64]
 Runs = npt.NDArray[np.int16]
 Ints = npt.NDArray[np.int32]
 Sums = npt.NDArray[np.int64]

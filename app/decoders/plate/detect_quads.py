@@ -17,9 +17,8 @@ import numpy.typing as npt
 
 from app.compiled import ieee_kernel, ieee_loop, ieee_loop_kernel, step
 from app.decoders.plate.detect_blobs import AREA, PEAK, SIGN, X0, X1, XX, XY, Y0, Y1, YY, MarkerSignal, X, Y, find_blobs
+from app.values import Floats, Ints
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Signal = npt.NDArray[np.int16]
 Grey = npt.NDArray[np.uint8]
 

@@ -16,6 +16,7 @@ from app.decoders.plate.detect_quads import FOUND_ALL, MARKER_RATIO, MarkerQuad,
 from app.decoders.plate.marker_colours import SPOT_PITCH
 from app.decoders.plate.pose import marker_centroids, unit_centres
 from app.markers.plate import SIZES, PlateGeometry
+from app.values import Floats
 
 # === Candidates that are no plate, found out before they are fitted: odds from cheap features of the first homography.
 #
@@ -23,7 +24,6 @@ from app.markers.plate import SIZES, PlateGeometry
 # whether they are as uniform within and as different between each other as light and dark units.
 
 
-Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 
 UNIT_REACH = 0.3

@@ -28,7 +28,7 @@ from app.decoders.plate.normal_equations import (
     substitute,
 )
 from app.decoders.plate.pose import marker_centroids, unit_edges, unit_shapes
-from app.decoders.plate.profiles import NORMAL_TABLE, Floats, blur_quadrature
+from app.decoders.plate.profiles import NORMAL_TABLE, blur_quadrature
 from app.decoders.plate.synthesis import (
     BLUR,
     FIRST_GAP,
@@ -41,6 +41,7 @@ from app.decoders.plate.synthesis import (
     new_scratch,
 )
 from app.markers.plate import PlateGeometry
+from app.values import Floats
 
 # === Homographies between the image and the plate, and the corners that follow from them.
 

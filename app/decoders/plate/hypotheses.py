@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from app.compiled import kernel, routine, step
 from app.decoders.plate.normal_equations import subtract_rows
-from app.decoders.plate.profiles import Floats, Ints
-from app.decoders.plate.synthesis import Light, PlatePatch
+from app.decoders.plate.synthesis import PlatePatch
+from app.values import Floats, Floats32, Ints
 
 # === The image around a plate, in linear light and averaged to about two or three pixels a unit.
 
@@ -65,10 +65,10 @@ def cut_patch(image: Frame, corners_px: Array, wanted_px: float, linear: bool) -
     step = np.array([(x1 - x0) / wide, (y1 - y0) / tall])
     patch = image[y0:y1, x0:x1]
     luma = cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY) if patch.ndim == 3 else np.ascontiguousarray(patch)
-    light: Light = np.asarray(cv2.LUT(luma, _LINEAR if linear else _LIGHT), np.float32)
+    light: Floats32 = np.asarray(cv2.LUT(luma, _LINEAR if linear else _LIGHT), np.float32)
     if (tall, wide) != light.shape:
         light = np.asarray(cv2.resize(light, (wide, tall), interpolation=cv2.INTER_AREA), np.float32)
-    weights: Light = np.ones_like(light) if linear else _WEIGHTS[(light * 255 + 0.5).astype(np.uint8)]
+    weights: Floats32 = np.ones_like(light) if linear else _WEIGHTS[(light * 255 + 0.5).astype(np.uint8)]
     grid = np.array([x0 + (step[0] - 1) / 2, y0 + (step[1] - 1) / 2, step[0], step[1]])
     return PlatePatch(light, weights, grid)
 
@@ -147,7 +147,6 @@ MAX_DECAY = 40.0
 """[1] exponent beyond which an exponential counts as that of this."""
 MIN_PIVOT = 1e-7
 """[1] square of a diagonal entry of a factor at least, relative to the light. Source: rounding of single precision."""
-Singles = npt.NDArray[np.float32]
 
 
 class ShownUnits(NamedTuple):
@@ -168,7 +167,7 @@ class Around(NamedTuple):
 
 
 @routine
-def _factorize(matrix: Singles) -> float:
+def _factorize(matrix: Floats32) -> float:
     """Replace the upper triangle of the first columns by the transposed Cholesky factor, the others by forward
     substitution; returns half the logarithm of the determinant.
     """
@@ -187,7 +186,7 @@ def _factorize(matrix: Singles) -> float:
 
 
 @routine
-def _column_square(matrix: Singles, column: int) -> float:
+def _column_square(matrix: Floats32, column: int) -> float:
     """Sum of the squares of a column."""
     total = 0.0
     for i in range(matrix.shape[0]):
@@ -327,7 +326,7 @@ def _add_veil(variance: float, length_mm: float, local: Local, i: int) -> None:
 
 
 @routine
-def _set_row(light: LightPrior, local: Local, own: float, i: int, read: Singles, others: Singles) -> None:
+def _set_row(light: LightPrior, local: Local, own: float, i: int, read: Floats32, others: Floats32) -> None:
     """Set row i of the covariances of the unit as read, and of it flipped and both under a smooth stain."""
     x_mm, y_mm, seen, flipped = local.x_mm, local.y_mm, local.seen, local.flipped
     share, reach, paint = local.share, local.reach, local.paint
@@ -356,7 +355,7 @@ def _set_row(light: LightPrior, local: Local, own: float, i: int, read: Singles,
 
 @routine
 def _set_covered(
-    pattern: PlatePattern, blur_mm: float, unit: int, local: Local, spots: Floats, first: int, columns: Singles
+    pattern: PlatePattern, blur_mm: float, unit: int, local: Local, spots: Floats, first: int, columns: Floats32
 ) -> None:
     """Set the light that each white spot would send to each pixel, then that of what it hides, a column a spot."""
     count = spots.shape[1]
@@ -385,7 +384,7 @@ def _set_covered(
 
 
 @step
-def _spot_likelihood(spots: Spots, matrix: Singles, first: int) -> float:
+def _spot_likelihood(spots: Spots, matrix: Floats32, first: int) -> float:
     """Mean likelihood of the spots, as a logarithm without the determinant.
 
     `matrix` is factorized with the covariance of the unit as read: a spot that hides a unit looks like what was read,

@@ -18,10 +18,9 @@ from app.compiled import kernel, loop, step
 from app.decoders.plate import Array
 from app.decoders.plate.hypotheses import PlatePixels
 from app.decoders.plate.normal_equations import factorize, invert, solve_factorized, substitute
-from app.decoders.plate.profiles import Floats as ProfilesFloats
-from app.decoders.plate.profiles import Ints
 from app.decoders.plate.unit_patterns import minimize_pattern
 from app.markers.plate import unit_index
+from app.values import Floats, Ints
 
 KNOT_MM = 20.0
 """[mm] distance of the knots between which the light is linear."""
@@ -73,16 +72,16 @@ class Knots(NamedTuple):
     side_mm: float  # [mm] of the plate
     # shape (K, band + ROWS): inverse of the correlation of the light at all knots: row i holds the entries of the
     # columns i to i + band, and zeros
-    precision: ProfilesFloats
+    precision: Floats
 
 
 class _Field(NamedTuple):
     """What is fitted, changed in place: light and noise of each pixel, reflectance that it sees; those of the parts."""
 
-    light: ProfilesFloats
-    noise: ProfilesFloats
-    seen: ProfilesFloats
-    albedo: ProfilesFloats
+    light: Floats
+    noise: Floats
+    seen: Floats
+    albedo: Floats
 
 
 def fit_light(pixels: PlatePixels, white: Array, parts: Array, albedo: Array, side_mm: float) -> LightField:
@@ -130,7 +129,7 @@ def _knots(side_mm: float) -> Knots:
 
 
 @step
-def _set_seen(white: ProfilesFloats, parts: ProfilesFloats, field: _Field) -> None:
+def _set_seen(white: Floats, parts: Floats, field: _Field) -> None:
     """Set the reflectance that each pixel sees."""
     for p in range(white.size):
         total = white[p]
@@ -148,7 +147,7 @@ def _set_noise(pixels: PlatePixels, sigma: float, field: _Field) -> None:
 
 
 @loop
-def _factorize_band(matrix: ProfilesFloats, band: int) -> None:
+def _factorize_band(matrix: Floats, band: int) -> None:
     """Replace the band of a symmetric matrix, stored as `Knots.precision`, by that of its transposed Cholesky factor.
 
     Rows are subtracted four at a time (`normal_equations.factorize`): the columns beyond the band are
@@ -180,7 +179,7 @@ def _factorize_band(matrix: ProfilesFloats, band: int) -> None:
 
 
 @loop
-def _solve_band(factor: ProfilesFloats, band: int, values: ProfilesFloats) -> None:
+def _solve_band(factor: Floats, band: int, values: Floats) -> None:
     """Replace the right side of a system by its solution."""
     size = factor.shape[0]
     for i in range(size):
@@ -237,7 +236,7 @@ def _fit_knots(pixels: PlatePixels, knots: Knots, spread: float, field: _Field) 
 
 
 @loop
-def _set_knots(places_mm: ProfilesFloats, p: int, knots: Knots, near: Ints, weights: ProfilesFloats) -> None:
+def _set_knots(places_mm: Floats, p: int, knots: Knots, near: Ints, weights: Floats) -> None:
     """Set the four knots around a pixel, in ascending order, and their weights."""
     count = knots.along
     x = min(max(places_mm[p, 0] / knots.side_mm, 0.0), 1.0) * (count - 1)
@@ -253,7 +252,7 @@ def _set_knots(places_mm: ProfilesFloats, p: int, knots: Knots, near: Ints, weig
 
 
 @step
-def _fit_albedo(pixels: PlatePixels, white: ProfilesFloats, parts: ProfilesFloats, field: _Field) -> None:
+def _fit_albedo(pixels: PlatePixels, white: Floats, parts: Floats, field: _Field) -> None:
     """Set the reflectances of the parts for the present light."""
     count = parts.shape[1]
     ridge = ALBEDO_WEIGHT * np.median(1.0 / field.noise) * pixels.level * pixels.level
@@ -279,7 +278,7 @@ def _fit_albedo(pixels: PlatePixels, white: ProfilesFloats, parts: ProfilesFloat
 
 
 @kernel
-def _fit_field(pixels: PlatePixels, white: ProfilesFloats, parts: ProfilesFloats, knots: Knots, field: _Field) -> float:
+def _fit_field(pixels: PlatePixels, white: Floats, parts: Floats, knots: Knots, field: _Field) -> float:
     """Fit light and reflectances in turns; returns the standard deviation of the light, relative."""
     spread = LIGHT_SPREAD[1]
     sigma = FIRST_NOISE * pixels.level

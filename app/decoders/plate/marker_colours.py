@@ -19,8 +19,8 @@ from app.decoders.plate.fit import project
 from app.decoders.plate.pose import marker_centroids, unit_centres, unit_edges
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateOutcome
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 
 

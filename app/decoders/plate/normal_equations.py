@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.compiled import kernel, loop, routine, step
-from app.decoders.plate.profiles import Floats, Ints, Quadrature
+from app.decoders.plate.profiles import Quadrature
 from app.decoders.plate.synthesis import (
     FIRST_GAP,
     FIRST_ROAD,
@@ -26,6 +26,7 @@ from app.decoders.plate.synthesis import (
     set_pose_derivatives,
     synthesize,
 )
+from app.values import Floats, Ints
 
 # === Small symmetric positive definite systems on one thread.
 #

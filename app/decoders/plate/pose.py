@@ -20,22 +20,20 @@ from app.geodesy import enu_from_heading, wgs84_from_enu
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlatePose, PlateReading
 from app.sensors.camera import Camera
+from app.values import Floats
 
 # === Where the shapes of a plate lie, in plate sides: (0, 0) is the triangle's corner, (1, 1) the opposite one.
 
 
-FloatArray = npt.NDArray[np.float64]
-
-
 @lru_cache
-def unit_edges(geometry: PlateGeometry) -> FloatArray:
+def unit_edges(geometry: PlateGeometry) -> Floats:
     """Low and high edge of every unit along a side, in plate sides, shape (n, 2)."""
     low = (geometry.gap_mm + np.arange(geometry.n) * geometry.pitch_mm) / geometry.side_mm
     return np.stack([low, low + geometry.unit_mm / geometry.side_mm], axis=1)
 
 
 @lru_cache
-def marker_centroids(geometry: PlateGeometry) -> FloatArray:
+def marker_centroids(geometry: PlateGeometry) -> Floats:
     """Centroids of the triangle and the three squares, clockwise, in plate sides, shape (4, 2)."""
     edges = unit_edges(geometry)
     low, side = edges[0, 0], edges[1, 1] - edges[0, 0]
@@ -45,7 +43,7 @@ def marker_centroids(geometry: PlateGeometry) -> FloatArray:
 
 
 @lru_cache
-def unit_centres(geometry: PlateGeometry) -> FloatArray:
+def unit_centres(geometry: PlateGeometry) -> Floats:
     """Centres of the units that carry the code, in plate sides, shape (units, 2)."""
     middle = unit_edges(geometry).mean(axis=1)
     rows, columns = np.nonzero(unit_shapes(geometry.n) >= 0)

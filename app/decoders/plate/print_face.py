@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from app.decoders.plate.pose import unit_shapes
 from app.markers.plate import PlateGeometry
+from app.values import Floats, Floats32
 
 PX_PER_MM = 2.0
 """[px/mm] of the rectified face. A gap of 2 mm has four pixels."""
@@ -39,17 +40,14 @@ _REFINEMENTS = 2  # of the homography by the units' edges
 _MIN_CENTRES = 8  # measured units that refine the homography
 _MAX_OFF_MM = 1.5  # [mm] of a unit that counts as in its place in the homography
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredFace:
     """A plate's face as it was printed."""
 
-    reflectance: Floats  # float32, shape (H, W, 3): linear, relative to the light units; blue, green, red
-    image_from_face: Array  # shape (3, 3): millimetres to pixels of the photo
-    levels: Array  # shape (n, n): luminance of each unit relative to the light ones, NaN in the corner cells
+    reflectance: Floats32  # float32, shape (H, W, 3): linear, relative to the light units; blue, green, red
+    image_from_face: Floats  # shape (3, 3): millimetres to pixels of the photo
+    levels: Floats  # shape (n, n): luminance of each unit relative to the light ones, NaN in the corner cells
     dark: npt.NDArray[np.bool_]  # shape (n, n): whether a unit looks dark; False in the corner cells
     # `dark_level`, `gap_level`: medians of the dark units and of the gaps
     dark_level: float
@@ -59,18 +57,18 @@ class MeasuredFace:
     clipped: float  # share of the light units' pixels that are over-exposed
     # shape (n, n, 2): [mm] how far units lie right of and below their places, by one edge where they touch a neighbour;
     # NaN where they were not measured
-    offsets_mm: Array
-    widths_mm: Array  # shape (n, n, 2): [mm] widths and heights of units, NaN where they were not measured
+    offsets_mm: Floats
+    widths_mm: Floats  # shape (n, n, 2): [mm] widths and heights of units, NaN where they were not measured
     merged: float  # share of the units that stand out of the gaps and touch a neighbour
     edge_mm: float  # [mm] median width of edges from 10 to 90 %; of the steepest ones where the gaps are closed
 
     @property
-    def luminance(self) -> Floats:
+    def luminance(self) -> Floats32:
         """Of the face, relative to the light units, shape (H, W)."""
         return np.asarray(self.reflectance @ _LUMA, np.float32)
 
 
-def rectify_face(image: npt.NDArray[np.uint8], image_from_face: Array, geometry: PlateGeometry) -> Floats:
+def rectify_face(image: npt.NDArray[np.uint8], image_from_face: Floats, geometry: PlateGeometry) -> Floats32:
     """Linear light of a plate's face, shape (H, W, 3); the photo is averaged down first where it is finer."""
     size = round(geometry.side_mm * PX_PER_MM)
     corners = cv2.perspectiveTransform(_square(geometry.side_mm)[None], image_from_face)[0]
@@ -94,7 +92,7 @@ def rectify_face(image: npt.NDArray[np.uint8], image_from_face: Array, geometry:
     return np.asarray(cv2.warpPerspective(light, warp, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
-def measure_face(image: npt.NDArray[np.uint8], corners_px: Array, geometry: PlateGeometry) -> MeasuredFace | None:
+def measure_face(image: npt.NDArray[np.uint8], corners_px: Floats, geometry: PlateGeometry) -> MeasuredFace | None:
     """Rectify a plate, even its light, and measure its units.
 
     Parameters
@@ -112,7 +110,7 @@ def measure_face(image: npt.NDArray[np.uint8], corners_px: Array, geometry: Plat
         None where the units have one level only.
     """
     source = _square(geometry.side_mm).astype(np.float32)
-    image_from_face: Array = cv2.getPerspectiveTransform(source, corners_px.astype(np.float32)).astype(np.float64)
+    image_from_face: Floats = cv2.getPerspectiveTransform(source, corners_px.astype(np.float32)).astype(np.float64)
     for _ in range(_REFINEMENTS):
         face = _measure(image, image_from_face, geometry)
         if face is None:
@@ -122,7 +120,7 @@ def measure_face(image: npt.NDArray[np.uint8], corners_px: Array, geometry: Plat
     return _measure(image, image_from_face, geometry)
 
 
-def unit_centres_mm(geometry: PlateGeometry) -> Array:
+def unit_centres_mm(geometry: PlateGeometry) -> Floats:
     """Places of all units on the face, shape (n, n, 2): right, down. [mm]"""
     middle = geometry.gap_mm + geometry.unit_mm / 2 + geometry.pitch_mm * np.arange(geometry.n)
     return np.stack(np.meshgrid(middle, middle), axis=-1)
@@ -133,7 +131,7 @@ def is_unit(n: int) -> npt.NDArray[np.bool_]:
     return np.asarray(unit_shapes(n) >= 0)
 
 
-def window(at_mm: Array, reach_mm: float | Array, size: int) -> tuple[slice, slice]:
+def window(at_mm: Floats, reach_mm: float | Floats, size: int) -> tuple[slice, slice]:
     """Rows and columns of the face about a place."""
     low = np.clip(np.round((at_mm - reach_mm) * PX_PER_MM).astype(int), 0, size - 1)
     high = np.clip(np.round((at_mm + reach_mm) * PX_PER_MM).astype(int), low + 1, size)
@@ -145,11 +143,11 @@ _LINEAR = np.where(_VALUES <= 0.04045, _VALUES / 12.92, ((_VALUES + 0.055) / 1.0
 """Linear light of the values of a photo. Source: IEC 61966-2-1."""
 
 
-def _square(side_mm: float) -> Array:
+def _square(side_mm: float) -> Floats:
     return np.array([(0.0, 0.0), (side_mm, 0.0), (side_mm, side_mm), (0.0, side_mm)])
 
 
-def _measure(image: npt.NDArray[np.uint8], image_from_face: Array, geometry: PlateGeometry) -> MeasuredFace | None:
+def _measure(image: npt.NDArray[np.uint8], image_from_face: Floats, geometry: PlateGeometry) -> MeasuredFace | None:
     light = rectify_face(image, image_from_face, geometry)
     places = unit_centres_mm(geometry)
     units = is_unit(geometry.n)
@@ -189,7 +187,7 @@ def _measure(image: npt.NDArray[np.uint8], image_from_face: Array, geometry: Pla
     )  # fmt: skip
 
 
-def _even_light(luma: Array, places: Array) -> tuple[npt.NDArray[np.bool_], Array] | None:
+def _even_light(luma: Floats, places: Floats) -> tuple[npt.NDArray[np.bool_], Floats] | None:
     """Which units are dark, and the coefficients of the light's logarithm, a polynomial of second degree.
 
     The polynomial and one level for each of the two paints are fitted by least squares, with Huber's weights.
@@ -214,16 +212,16 @@ def _even_light(luma: Array, places: Array) -> tuple[npt.NDArray[np.bool_], Arra
     return dark, solution[:5]
 
 
-def _terms(places: list[Array]) -> Array:
+def _terms(places: list[Floats]) -> Floats:
     x, y = places
     return np.stack([x, y, x * x, x * y, y * y], axis=-1)
 
 
-def _field(places: list[Array], coefficients: Array) -> Array:
+def _field(places: list[Floats], coefficients: Floats) -> Floats:
     return np.asarray(_terms(places) @ coefficients)
 
 
-def _gap_level(luminance: Floats, geometry: PlateGeometry) -> float:
+def _gap_level(luminance: Floats32, geometry: PlateGeometry) -> float:
     """Median of the crossings of gaps, away from the units."""
     lines = geometry.gap_mm / 2 + geometry.pitch_mm * np.arange(1, geometry.n)
     inner = [(x, y) for x in lines for y in lines]
@@ -232,15 +230,15 @@ def _gap_level(luminance: Floats, geometry: PlateGeometry) -> float:
     return float(np.median([np.median(value) for value in values]))
 
 
-def _stands_out(levels: Array, paints: Array, gap_level: float, contrast: float) -> npt.NDArray[np.bool_]:
+def _stands_out(levels: Floats, paints: Floats, gap_level: float, contrast: float) -> npt.NDArray[np.bool_]:
     """Units whose paint differs from the gaps, and that have it."""
     limit = MIN_EDGE_CONTRAST * contrast
     return np.asarray((np.abs(paints - gap_level) > limit) & (np.abs(levels - paints) < limit))
 
 
 def _edges(
-    luminance: Floats, levels: Array, standing: npt.NDArray[np.bool_], gap_level: float, geometry: PlateGeometry
-) -> tuple[Array, Array, list[float]]:
+    luminance: Floats32, levels: Floats, standing: npt.NDArray[np.bool_], gap_level: float, geometry: PlateGeometry
+) -> tuple[Floats, Floats, list[float]]:
     """Offsets and sizes of the units that stand out of the gaps, and the widths of their edges. [mm]"""
     n, places = geometry.n, unit_centres_mm(geometry)
     offsets, widths = np.full((n, n, 2), np.nan), np.full((n, n, 2), np.nan)
@@ -257,13 +255,13 @@ def _edges(
     return offsets, widths, blurs
 
 
-def _steepest_edge_mm(luminance: Floats, contrast: float) -> float:
+def _steepest_edge_mm(luminance: Floats32, contrast: float) -> float:
     """Width of the steepest edges of a face from 10 to 90 %, where the gaps are closed. [mm]"""
     slopes = np.hypot(*np.gradient(luminance)) * PX_PER_MM
     return float(0.8 * contrast / max(np.percentile(slopes, _STEEPEST), 1e-6))
 
 
-def _profile(luminance: Floats, at_mm: Array, geometry: PlateGeometry, axis: int) -> tuple[Floats, Array]:
+def _profile(luminance: Floats32, at_mm: Floats, geometry: PlateGeometry, axis: int) -> tuple[Floats32, Floats]:
     """Luminance along a line through a unit's place, the median across it, and the places of its samples. [mm]"""
     long_mm = (0.5 + _EDGE_REACH) * geometry.unit_mm + geometry.gap_mm
     across = CENTRE_SHARE * geometry.unit_mm / 2
@@ -274,7 +272,7 @@ def _profile(luminance: Floats, at_mm: Array, geometry: PlateGeometry, axis: int
     return profile, (np.arange(len(profile)) + start + 0.5) / PX_PER_MM - at_mm[axis]
 
 
-def _find_edges(at: Array, inside: npt.NDArray[np.floating], geometry: PlateGeometry) -> list[tuple[float, float]]:
+def _find_edges(at: Floats, inside: npt.NDArray[np.floating], geometry: PlateGeometry) -> list[tuple[float, float]]:
     """How far the lower and the upper edge of a unit are off their places, and their widths from 10 to 90 %. [mm]
 
     An edge is missing where the unit touches its neighbour.
@@ -295,13 +293,13 @@ def _find_edges(at: Array, inside: npt.NDArray[np.floating], geometry: PlateGeom
     return found
 
 
-def _crossing(at: Array, inside: npt.NDArray[np.floating], k: int) -> float:
+def _crossing(at: Floats, inside: npt.NDArray[np.floating], k: int) -> float:
     """Where the line between samples k and k + 1 is 0."""
     a, b = float(inside[k]), float(inside[k + 1])
     return float(at[k] + (at[k + 1] - at[k]) * a / (a - b))
 
 
-def _correction(offsets_mm: Array, widths_mm: Array, geometry: PlateGeometry) -> Array:
+def _correction(offsets_mm: Floats, widths_mm: Floats, geometry: PlateGeometry) -> Floats:
     """Homography from the face as drawn to the face as it was found; identity where few units were measured."""
     known = np.isfinite(widths_mm).all(axis=-1)
     if known.sum() < _MIN_CENTRES:

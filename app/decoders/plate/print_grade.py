@@ -27,6 +27,7 @@ from app.errors import PrintNotGraded
 from app.markers.plate import PlateCode, PlateGeometry, reed_solomon_words, unit_index
 from app.markers.print_grade import LETTERS, THRESHOLDS, PrintGrade, PrintParameter, PrintParameterName, PrintView
 from app.markers.reading import PlateReading
+from app.values import Floats
 
 # === Parameters of a print grade: what was measured on a face -> values, grades, causes and cures.
 
@@ -48,8 +49,6 @@ WHITE = 0.75
 app/simulation/plate_face.py."""
 _NAMES = ("red triangle", "green square top right", "green square bottom right", "green square bottom left")
 
-Array = npt.NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True)
 class PrintEvidence:
@@ -58,7 +57,7 @@ class PrintEvidence:
     face: MeasuredFace
     code: PlateCode  # what the plate should be
     geometry: PlateGeometry  # of the drawing
-    axes: tuple[Array, Array]  # the print's axes, right and down, in the camera's frame, shape (3,) each
+    axes: tuple[Floats, Floats]  # the print's axes, right and down, in the camera's frame, shape (3,) each
     reading: PlateReading  # of the photo, without a registry
     with_registry: bool  # whether it is read with the registry that has the code
 
@@ -74,7 +73,7 @@ def grade_parameters(evidence: PrintEvidence) -> tuple[PrintParameter, ...]:
     return (*parameters, _decode(evidence))
 
 
-def reflectance_margins(face: MeasuredFace, code: PlateCode) -> Array:
+def reflectance_margins(face: MeasuredFace, code: PlateCode) -> Floats:
     """How far each unit is on its side of the threshold, over half the contrast; negative: on the other side.
 
     Notes
@@ -128,7 +127,7 @@ def _margin(evidence: PrintEvidence) -> PrintParameter:
                     "print the unit in the other paint where it is wrong; otherwise as for modulation")  # fmt: skip
 
 
-def _by_unit(evidence: PrintEvidence, name: PrintParameterName, values: Array, cure: str) -> PrintParameter:
+def _by_unit(evidence: PrintEvidence, name: PrintParameterName, values: Floats, cure: str) -> PrintParameter:
     row, column = np.unravel_index(np.nanargmin(values), values.shape)
     at = (int(row) + 1, int(column) + 1)
     paint = "dark" if evidence.code.units[row, column] else "light"
@@ -141,7 +140,7 @@ def _by_unit(evidence: PrintEvidence, name: PrintParameterName, values: Array, c
     return _graded(name, 100 * values[row, column], finding, cure, at, grade)
 
 
-def _with_correction(code: PlateCode, values: Array, name: PrintParameterName) -> float:
+def _with_correction(code: PlateCode, values: Floats, name: PrintParameterName) -> float:
     """Grade of values of units when cells below a grade are left to error correction, the best over all grades.
 
     Source: ISO/IEC 15415, modulation: the lower of the grade assumed and of the error correction left by it.
@@ -238,7 +237,7 @@ def _colour(evidence: PrintEvidence) -> PrintParameter:
     )  # fmt: skip
 
 
-def _encoded(light: npt.NDArray[np.floating]) -> Array:
+def _encoded(light: npt.NDArray[np.floating]) -> Floats:
     """sRGB of linear light, 0 to 1."""
     clipped = np.clip(light, 0, 1).astype(np.float64)
     return np.asarray(np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055))
@@ -266,7 +265,7 @@ def _damage(evidence: PrintEvidence) -> PrintParameter:
     )  # fmt: skip
 
 
-def _damaged_shares(face: MeasuredFace, code: PlateCode, geometry: PlateGeometry) -> Array:
+def _damaged_shares(face: MeasuredFace, code: PlateCode, geometry: PlateGeometry) -> Floats:
     """Share of each unit's area that differs from its paint, NaN in the corner cells, shape (n, n).
 
     A unit that differs as a whole while the gaps around it do not is faded or wrong, not stained: it has no share.
@@ -288,7 +287,7 @@ def _damaged_shares(face: MeasuredFace, code: PlateCode, geometry: PlateGeometry
     return shares
 
 
-def _gap_share(face: MeasuredFace, luminance: npt.NDArray[np.float32], at_mm: Array, geometry: PlateGeometry) -> float:
+def _gap_share(face: MeasuredFace, luminance: npt.NDArray[np.float32], at_mm: Floats, geometry: PlateGeometry) -> float:
     """Share of the gaps around a unit that differs from the other gaps."""
     middle, reach = (geometry.unit_mm + geometry.gap_mm) / 2, geometry.gap_mm / 4
     along = np.array([geometry.unit_mm / 2, reach])
@@ -452,7 +451,7 @@ def _find_plate(photo: Image, code: PlateCode | None, geometry: PlateGeometry | 
     return _moved(best, corners_px), with_registry
 
 
-def _moved(reading: PlateReading, corners_px: Array) -> PlateReading:
+def _moved(reading: PlateReading, corners_px: Floats) -> PlateReading:
     return PlateReading(
         reading.outcome, corners_px, code=reading.code, confidence=reading.confidence, geometry=reading.geometry,
         corrected_cells=reading.corrected_cells, reason=reading.reason,
@@ -505,11 +504,11 @@ def _check_agreement(reading: PlateReading, expected: PlateCode, face: MeasuredF
 # --- the photo --------------------------------------------------------------------------------------------------------
 
 
-def _side_px(corners_px: Array) -> float:
+def _side_px(corners_px: Floats) -> float:
     return float(np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).mean())
 
 
-def _check_size(photo: Image, corners_px: Array, geometry: PlateGeometry) -> None:
+def _check_size(photo: Image, corners_px: Floats, geometry: PlateGeometry) -> None:
     side_px = _side_px(corners_px)
     least_px = max(MIN_SIDE_PX, MIN_GAP_PX * geometry.side_mm / geometry.gap_mm)
     if side_px < least_px:
@@ -581,8 +580,8 @@ def _check_view(view: PrintView, geometry: PlateGeometry) -> None:
 
 
 def _axes(
-    photo: Image, image_from_face: Array, geometry: PlateGeometry, focal_35mm: float | None
-) -> tuple[tuple[Array, Array], float]:
+    photo: Image, image_from_face: Floats, geometry: PlateGeometry, focal_35mm: float | None
+) -> tuple[tuple[Floats, Floats], float]:
     """The print's own axes, right and down, in the camera's frame at the plate's centre, and the camera's tilt [deg].
 
     With the camera's matrix K, a homography of a plane is K [r1 r2 t] up to a factor; a print that is stretched or

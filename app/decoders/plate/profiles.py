@@ -15,12 +15,9 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from app.compiled import loop, routine, step
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from app.values import Floats, Ints
 
 NORMAL_REACH = 4.25
 """[standard deviations] end of the table of the normal distribution, beyond which 1e-5 of it lies."""

@@ -38,9 +38,9 @@ from app.errors import InvalidParameter
 from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode, PlateGeometry, plate_capacity
 from app.markers.reading import PlateGrade, PlateOutcome, PlateReading
 from app.sensors.camera import Camera
+from app.values import Floats
 
 Frame = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float64]
 Refusal = tuple[PlateOutcome, str]
 
 DEFAULT_GEOMETRIES = EXPECTED_GEOMETRIES

@@ -13,21 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from app.compiled import kernel, loop, routine, step
-from app.decoders.plate.profiles import (
-    AxisBlur,
-    AxisProfiles,
-    Floats,
-    Ints,
-    Quadrature,
-    blur_quadrature,
-    normal,
-    set_profiles,
-)
-
-Light = npt.NDArray[np.float32]
+from app.decoders.plate.profiles import AxisBlur, AxisProfiles, Quadrature, blur_quadrature, normal, set_profiles
+from app.values import Floats, Floats32, Ints
 
 POSE = 10
 """Unknowns of pose and blur: eight of the homography, logarithm of the lens blur, square of the motion's length."""
@@ -61,8 +50,8 @@ class PlatePatch(NamedTuple):
     """The image around a plate."""
 
     # `light`, `weights`: float32, shape (h, w): [1] linear light of each pixel, and the weight of its squared error
-    light: Light
-    weights: Light
+    light: Floats32
+    weights: Floats32
     # shape (4,): [px] place of pixel (0, 0) in the frame, x and y, and the distance to the next one, x and y
     grid: Floats
 

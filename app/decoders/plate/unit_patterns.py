@@ -7,11 +7,9 @@ the cost of a pattern is r^T W r with r = y + c d: what light alone must explain
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from app.compiled import ieee_kernel, ieee_routine, step
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 MIN_GAIN = 1e-9
 """[cost] by which a flip must lower the cost. Source: rounding."""

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +28,7 @@ from app.decoders.plate.unit_likelihoods import code_units
 from app.markers.plate import SIDE_MM, PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
 from app.sensors.camera import Camera
+from app.values import JsonObject
 
 # === Which candidates of successive frames are the same plate: its place on the road follows from the vehicle's speed.
 
@@ -268,7 +268,7 @@ class PlateVideoSearch:
         geometries: Sequence[PlateGeometry] = DEFAULT_GEOMETRIES, *, thermal: bool = False,
     ) -> None:  # fmt: skip
         self._camera, self._codebook = camera, tuple(codebook)
-        self._options: dict[str, Any] = {"camera": camera, "codebook": codebook, "thermal": thermal}
+        self._options: JsonObject = {"camera": camera, "codebook": codebook, "thermal": thermal}
         self._geometries = tuple(geometries) or DEFAULT_GEOMETRIES
         self._options["geometries"] = self._geometries
         self._known = {code.digits for code in codebook}

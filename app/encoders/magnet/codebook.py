@@ -25,8 +25,8 @@ from app.markers.magnet_design import (
     placements_of,
     separation_for,
 )
+from app.values import Floats
 
-FloatArray = npt.NDArray[np.float64]
 _Pattern = tuple[Polarity, ...]
 
 
@@ -174,8 +174,8 @@ def _full(book: Codebook, asked: int, fit: int, rules: CodebookRules) -> Codeboo
 class _Placements(NamedTuple):
     """Placements of a design's magnets, and how they are read."""
 
-    u: FloatArray  # (K, M - 2), middle magnets' places over the tag's length
-    inverse: FloatArray  # (K, M - 2, M - 2), of the covariance of u
+    u: Floats  # (K, M - 2), middle magnets' places over the tag's length
+    inverse: Floats  # (K, M - 2, M - 2), of the covariance of u
 
 
 class _CodeSpace:
@@ -221,7 +221,7 @@ class _CodeSpace:
         """Indices (later, earlier) of tags that may be confused; twice the same where a tag reads as its reverse."""
         pairs: set[tuple[int, int]] = set()
         for views in (_whole, self._remains):
-            by_pattern: dict[_Pattern, list[tuple[int, FloatArray]]] = {}
+            by_pattern: dict[_Pattern, list[tuple[int, Floats]]] = {}
             for i, tag in enumerate(tags):
                 for pattern, gaps_m in views(tag):
                     by_pattern.setdefault(pattern, []).append((i, gaps_m))
@@ -251,7 +251,7 @@ class _CodeSpace:
             self._near_rows[tag.gap_steps] = self._near(np.array(tag.gaps_m), self._all)
         return self._near_rows[tag.gap_steps]
 
-    def _near(self, gaps_m: FloatArray, others: _Placements) -> npt.NDArray[np.bool_]:
+    def _near(self, gaps_m: Floats, others: _Placements) -> npt.NDArray[np.bool_]:
         """Which of K placements are nearer to a code's than the rules allow, as seen from either side."""
         if len(gaps_m) < 2:  # two magnets have no ratio
             return np.ones(len(others.u), dtype=bool)
@@ -262,14 +262,14 @@ class _CodeSpace:
         near: npt.NDArray[np.bool_] = np.minimum(from_here, from_there) < self._limit**2
         return near
 
-    def _placements(self, gaps_m: FloatArray) -> _Placements:
+    def _placements(self, gaps_m: Floats) -> _Placements:
         """Placements of gaps of shape (K, M - 1)."""
         if gaps_m.shape[1] < 2:
             return _Placements(np.empty((len(gaps_m), 0)), np.empty((len(gaps_m), 0, 0)))
         inverse = np.linalg.inv(covariance_of(gaps_m, self._rules.conditions))
         return _Placements(_places(gaps_m), np.asarray(inverse, dtype=np.float64))
 
-    def _remains(self, tag: InformationTag) -> Iterator[tuple[_Pattern, FloatArray]]:
+    def _remains(self, tag: InformationTag) -> Iterator[tuple[_Pattern, Floats]]:
         """What is left of a tag when one magnet is missed: polarities and gaps, for each of its magnets."""
         if not self._rules.survive_missing:
             return
@@ -277,7 +277,7 @@ class _CodeSpace:
         for i in range(tag.magnet_count):
             yield tag.polarities[:i] + tag.polarities[i + 1 :], _without(gaps_m, i)[0]
 
-    def _block_remains(self, pattern: _Pattern, gaps_m: FloatArray) -> None:
+    def _block_remains(self, pattern: _Pattern, gaps_m: Floats) -> None:
         """Block every code that, one magnet missed, is too near to what is left of a code."""
         key = tuple(np.round(gaps_m / self._design.segment_m).astype(int).tolist())
         if key not in self._lost_rows:
@@ -288,18 +288,18 @@ class _CodeSpace:
                 row |= near
 
 
-def _whole(tag: InformationTag) -> Iterator[tuple[_Pattern, FloatArray]]:
+def _whole(tag: InformationTag) -> Iterator[tuple[_Pattern, Floats]]:
     """A tag with none of its magnets missed: polarities and gaps."""
     yield tag.polarities, np.array(tag.gaps_m)
 
 
-def _without(gaps_m: FloatArray, missed: int) -> FloatArray:
+def _without(gaps_m: Floats, missed: int) -> Floats:
     """Gaps, shape (K, M - 2), of tags whose gaps are (K, M - 1), when one of their magnets is missed. [m]"""
     offsets_m = np.concatenate([np.zeros((len(gaps_m), 1)), np.cumsum(gaps_m, axis=1)], axis=1)
     return np.diff(np.delete(offsets_m, missed, axis=1), axis=1)
 
 
-def _places(gaps_m: FloatArray) -> FloatArray:
+def _places(gaps_m: Floats) -> Floats:
     """Middle magnets' places over the tag's length, shape (K, M - 2), of gaps of shape (K, M - 1)."""
-    places: FloatArray = np.cumsum(gaps_m, axis=1)
+    places: Floats = np.cumsum(gaps_m, axis=1)
     return places[:, :-1] / places[:, -1:]

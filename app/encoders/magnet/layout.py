@@ -19,7 +19,8 @@ from app.errors import InvalidParameter
 from app.markers.magnet import MAX_LINE_SPACING_M, InformationTag, LineStyle, LineTag, Orientation, Polarity, Tag
 from app.markers.magnet_design import Meaning, check_name
 from app.markers.reading import Check
-from app.roads.lane_line import FloatArray, LaneLine, bearing_deg, left_of
+from app.roads.lane_line import LaneLine, bearing_deg, left_of
+from app.values import Floats
 
 MAX_HOLES = 10_000
 """Magnets of a line at most. 60 km at 6 m."""
@@ -54,7 +55,7 @@ class Hole:
         return ways[self.polarity is Polarity.S]
 
     @property
-    def point_enu_m(self) -> FloatArray:
+    def point_enu_m(self) -> Floats:
         """Place in the lane's local frame, shape (3,). [m]"""
         return np.array([self.east_m, self.north_m, self.up_m])
 
@@ -76,7 +77,7 @@ class MagnetLayout:
         return self.holes[-1].along_m
 
     @property
-    def gaps_m(self) -> FloatArray:
+    def gaps_m(self) -> Floats:
         """Straight distances between neighbours, shape (holes - 1,). [m]"""
         points = np.array([hole.point_enu_m for hole in self.holes]).reshape(-1, 3)
         return np.asarray(np.linalg.norm(np.diff(points, axis=0), axis=1), dtype=np.float64)
@@ -184,7 +185,7 @@ def _check_chainage(field: str, chainage_m: float, lane: LaneLine) -> None:
         )
 
 
-def _point_ahead(lane: LaneLine, chainage_m: float, length_m: float) -> FloatArray:
+def _point_ahead(lane: LaneLine, chainage_m: float, length_m: float) -> Floats:
     """The place on the lane that is `length_m` away in a straight line, shape (3,). [m]"""
     start = lane.at(chainage_m)
     room_m = lane.length_m - chainage_m
@@ -209,9 +210,9 @@ def _point_ahead(lane: LaneLine, chainage_m: float, length_m: float) -> FloatArr
 
 def _holes(
     lane: LaneLine,
-    along_m: FloatArray,
-    located_m: FloatArray,
-    points: FloatArray,
+    along_m: Floats,
+    located_m: Floats,
+    points: Floats,
     polarities: Sequence[Polarity],
     forward_deg: float | None,
 ) -> tuple[Hole, ...]:

@@ -14,6 +14,7 @@ from app.encoders.magnet.layout import DrillingSheet, Hole, SheetFormat
 from app.encoders.pdf import POINTS_PER_MM, Canvas, EmbeddedFont, PdfFile
 from app.formats.text import TableWriter
 from app.markers.magnet import InformationTag, Orientation, Polarity
+from app.values import JsonObject
 
 # === Drilling sheet -> CSV: one row a hole.
 
@@ -73,7 +74,7 @@ def write_sheet_geojson(sheet: DrillingSheet) -> bytes:
     return orjson.dumps(sheet_document(sheet), option=orjson.OPT_INDENT_2)
 
 
-def sheet_document(sheet: DrillingSheet) -> dict[str, Any]:
+def sheet_document(sheet: DrillingSheet) -> JsonObject:
     """The same as plain values."""
     layout = sheet.layout
     features = [

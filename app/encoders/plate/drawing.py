@@ -13,13 +13,12 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from fontTools.pens.basePen import BasePen
 from fontTools.pens.transformPen import TransformPen
 
 from app.encoders.pdf import load_typeface
+from app.values import Floats
 
-FloatArray = npt.NDArray[np.float64]
 Anchor = Literal["start", "middle", "end"]
 
 
@@ -55,7 +54,7 @@ class Boxes:
     """Filled rectangles along the axes, shape (K, 4): left, bottom, right, top. [mm]"""
 
     layer: Layer
-    boxes_mm: FloatArray
+    boxes_mm: Floats
 
     def moved(self, x_mm: float, y_mm: float) -> Boxes:
         """The same rectangles elsewhere."""
@@ -67,7 +66,7 @@ class Shape:
     """A filled polygon without holes, shape (K, 2); its last point joins its first. [mm]"""
 
     layer: Layer
-    points_mm: FloatArray
+    points_mm: Floats
 
     def moved(self, x_mm: float, y_mm: float) -> Shape:
         """The same polygon elsewhere."""
@@ -79,7 +78,7 @@ class Stroke:
     """A drawn line of a width, open or closed, shape (K, 2). [mm]"""
 
     layer: Layer
-    points_mm: FloatArray
+    points_mm: Floats
     width_mm: float
     closed: bool = False
 
@@ -122,10 +121,10 @@ class Modules:
         return replace(self, x_mm=self.x_mm + x_mm, y_mm=self.y_mm + y_mm)
 
     @property
-    def boxes_mm(self) -> FloatArray:
+    def boxes_mm(self) -> Floats:
         """The runs as left, bottom, right, top, shape (K, 4). [mm]"""
         row, start, count = np.array(self.runs, dtype=np.float64).reshape(-1, 3).T
-        boxes: FloatArray = np.stack([start, -row - 1, start + count, -row], axis=1) * self.module_mm
+        boxes: Floats = np.stack([start, -row - 1, start + count, -row], axis=1) * self.module_mm
         boxes += np.array([self.x_mm, self.y_mm, self.x_mm, self.y_mm])
         return boxes
 
@@ -159,7 +158,7 @@ def moved(parts: Iterable[Part], x_mm: float, y_mm: float) -> tuple[Part, ...]:
     return tuple(part.moved(x_mm, y_mm) for part in parts)
 
 
-def box_points(left: float, bottom: float, right: float, top: float) -> FloatArray:
+def box_points(left: float, bottom: float, right: float, top: float) -> Floats:
     """Corners of a rectangle, clockwise from the upper left, shape (4, 2)."""
     return np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
 
@@ -247,7 +246,7 @@ class _Glyph:
     advance: int
     svg: str
     pdf: str
-    contours: tuple[FloatArray, ...]
+    contours: tuple[Floats, ...]
 
 
 class _OutlinePen(BasePen):  # type: ignore[misc]
@@ -331,7 +330,7 @@ def pdf_run(text: str) -> str:
 
 
 @lru_cache(maxsize=1024)
-def _run_contours(text: str) -> tuple[FloatArray, ...]:
+def _run_contours(text: str) -> tuple[Floats, ...]:
     pen, contours = 0, []
     for glyph in map(_glyph, text):
         contours += [contour + np.array([pen, 0.0]) for contour in glyph.contours]
@@ -350,7 +349,7 @@ def origin_mm(text: Text) -> tuple[float, float]:
     return text.x_mm - share * run_units(text.text) * scale_mm(text), text.y_mm
 
 
-def contours_mm(text: Text) -> list[FloatArray]:
+def contours_mm(text: Text) -> list[Floats]:
     """Flattened outlines of a text on its sheet; holes are contours of their own. [mm]"""
     return [contour * scale_mm(text) + np.array(origin_mm(text)) for contour in _run_contours(text.text)]
 

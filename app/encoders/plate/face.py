@@ -20,7 +20,6 @@ from app.encoders.plate.drawing import (
     Anchor,
     Boxes,
     Drawing,
-    FloatArray,
     Layer,
     Modules,
     Part,
@@ -35,6 +34,7 @@ from app.encoders.plate.drawing import (
 from app.errors import CodeMismatch, InvalidParameter
 from app.geodesy import check_lon_lat
 from app.markers.plate import PlateCode, PlateGeometry, unit_index
+from app.values import Floats
 
 # === What a fabricator is asked to make.
 
@@ -201,7 +201,7 @@ _TERMINAL_GAP_MM = 6.0
 
 
 @lru_cache(maxsize=64)
-def unit_boxes_mm(geometry: PlateGeometry) -> FloatArray:
+def unit_boxes_mm(geometry: PlateGeometry) -> Floats:
     """Left, bottom, right, top of every unit, row by row from the top, shape (n * n, 4). [mm]"""
     start = -geometry.side_mm / 2 + geometry.gap_mm + geometry.pitch_mm * np.arange(geometry.n)
     left, top = np.meshgrid(start, -start)
@@ -211,7 +211,7 @@ def unit_boxes_mm(geometry: PlateGeometry) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def marker_shapes_mm(geometry: PlateGeometry) -> tuple[FloatArray, ...]:
+def marker_shapes_mm(geometry: PlateGeometry) -> tuple[Floats, ...]:
     """Corner areas clockwise from the red triangle (3 points, its right angle first), then three squares. [mm]
 
     A marker covers its two by two units and the gap between them.
@@ -258,16 +258,16 @@ def code_face(code: PlateCode, geometry: PlateGeometry, options: ArtworkOptions)
     return tuple(part for part in parts if not isinstance(part, Boxes) or len(part.boxes_mm))
 
 
-def _centres(boxes: FloatArray) -> FloatArray:
+def _centres(boxes: Floats) -> Floats:
     return (boxes[:, :2] + boxes[:, 2:]) / 2
 
 
-def _quarter_points(boxes: FloatArray, unit_mm: float) -> FloatArray:
+def _quarter_points(boxes: Floats, unit_mm: float) -> Floats:
     offsets = np.array([(-1, 1), (1, 1), (-1, -1), (1, -1)]) * unit_mm / 4
     return (_centres(boxes)[:, None, :] + offsets).reshape(-1, 2)
 
 
-def _led_boxes(centres: FloatArray) -> FloatArray:
+def _led_boxes(centres: Floats) -> Floats:
     half = LED_SIDE_MM / 2
     return np.hstack([centres - half, centres + half])
 
@@ -286,7 +286,7 @@ def _marker_leds(geometry: PlateGeometry) -> Boxes:
 
 
 @lru_cache(maxsize=64)
-def _heater_track(unit_mm: float) -> FloatArray:
+def _heater_track(unit_mm: float) -> Floats:
     """Outline of a meandering track round the origin that fills a unit."""
     half = unit_mm / 2 - _HEATER_INSET_MM - TRACK_MM / 2
     legs = max(int(2 * half // (TRACK_MM + _TRACK_GAP_MM)), 2)
@@ -297,7 +297,7 @@ def _heater_track(unit_mm: float) -> FloatArray:
     return _outline(track)
 
 
-def _heater_loop(marker: FloatArray) -> FloatArray:
+def _heater_loop(marker: Floats) -> Floats:
     """Outline of an open loop inside the edge of a marker; it leaves the middle to the light sources."""
     area = Polygon(marker)
     outer = area.buffer(-_HEATER_INSET_MM, join_style="mitre")
@@ -308,7 +308,7 @@ def _heater_loop(marker: FloatArray) -> FloatArray:
     return _outline(outer.difference(inner).difference(terminal))
 
 
-def _outline(area: Polygon) -> FloatArray:
+def _outline(area: Polygon) -> Floats:
     """Outer ring of a polygon without holes, its last point left out."""
     return np.asarray(shapely.get_coordinates(area.exterior)[:-1], dtype=np.float64)
 

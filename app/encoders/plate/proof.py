@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.encoders.plate.drawing import FACE_LAYERS, INKS, Boxes, Drawing, FloatArray, Shape, box_points
+from app.encoders.plate.drawing import FACE_LAYERS, INKS, Boxes, Drawing, Shape, box_points
 from app.encoders.plate.writers import Image
 from app.errors import ProofFailed
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
+from app.values import Floats
 
 PlateReader = Callable[[Image, PlateGeometry], Sequence[PlateReading]]
 """Reads an image, (H, W, 3) BGR, given the geometry to expect."""
@@ -41,7 +42,7 @@ class PlateProof:
     corner_error_px: float
 
 
-def render_face(drawing: Drawing, *, px_per_mm: float, plate: int = 0) -> tuple[Image, FloatArray]:
+def render_face(drawing: Drawing, *, px_per_mm: float, plate: int = 0) -> tuple[Image, Floats]:
     """What a camera straight above sees of a plate that lies in asphalt.
 
     Parameters
@@ -64,9 +65,9 @@ def render_face(drawing: Drawing, *, px_per_mm: float, plate: int = 0) -> tuple[
     shape = (ceil((top - bottom) * px_per_mm) + 2 * _ROAD_PX, ceil((right - left) * px_per_mm) + 2 * _ROAD_PX)
     image = np.full((*shape, 3), _ROAD_GREY, dtype=np.float32)
 
-    def pixels(points_mm: FloatArray) -> FloatArray:
+    def pixels(points_mm: Floats) -> Floats:
         corner_mm, scale = np.array([left, top]), np.array([px_per_mm, -px_per_mm])
-        points_px: FloatArray = (points_mm - corner_mm) * scale + (_ROAD_PX - 0.5)
+        points_px: Floats = (points_mm - corner_mm) * scale + (_ROAD_PX - 0.5)
         return points_px
 
     by_layer = drawing.by_layer()
@@ -89,8 +90,8 @@ def render_face(drawing: Drawing, *, px_per_mm: float, plate: int = 0) -> tuple[
 
 def _blend_boxes(
     image: npt.NDArray[np.float32],
-    upper_left_px: FloatArray,
-    lower_right_px: FloatArray,
+    upper_left_px: Floats,
+    lower_right_px: Floats,
     colour: npt.NDArray[np.float32],
 ) -> None:
     """Paint rectangles; a pixel at an edge takes the share that is covered, exactly."""
@@ -101,7 +102,7 @@ def _blend_boxes(
         region += (rows[:, None] * columns)[:, :, None] * (colour - region)
 
 
-def _blend_shape(image: npt.NDArray[np.float32], points_px: FloatArray, colour: npt.NDArray[np.float32]) -> None:
+def _blend_shape(image: npt.NDArray[np.float32], points_px: Floats, colour: npt.NDArray[np.float32]) -> None:
     """Paint a polygon; the share of a pixel that is covered is counted on a finer grid."""
     low, high = np.floor(points_px.min(axis=0)).astype(int), np.ceil(points_px.max(axis=0)).astype(int)
     width, height = (high - low + 1).tolist()

@@ -28,7 +28,6 @@ from app.encoders.plate.drawing import (
     UNDER_LAYERS,
     Boxes,
     Drawing,
-    FloatArray,
     Layer,
     Modules,
     Part,
@@ -43,6 +42,7 @@ from app.encoders.plate.drawing import (
     svg_run,
 )
 from app.errors import InvalidParameter
+from app.values import Floats
 
 if TYPE_CHECKING:
     from ezdxf.layouts.layout import Modelspace
@@ -100,14 +100,14 @@ def _paint_part(image: Image, part: Part, px_per_mm: float, origin_mm: tuple[flo
         _fill(image, contours_mm(part), bgr, px_per_mm, origin_mm)
 
 
-def _edges_px(points_mm: FloatArray, px_per_mm: float, origin_mm: tuple[float, float]) -> npt.NDArray[np.intp]:
+def _edges_px(points_mm: Floats, px_per_mm: float, origin_mm: tuple[float, float]) -> npt.NDArray[np.intp]:
     """Rounded positions of edges from the image's corner, halves up."""
     offsets = (points_mm - np.array(origin_mm)) * np.array([px_per_mm, -px_per_mm])
     edges: npt.NDArray[np.intp] = np.floor(offsets + 0.5 + 1e-9).astype(np.intp)
     return edges
 
 
-def _subpixels(points_mm: FloatArray, px_per_mm: float, origin_mm: tuple[float, float]) -> npt.NDArray[np.int32]:
+def _subpixels(points_mm: Floats, px_per_mm: float, origin_mm: tuple[float, float]) -> npt.NDArray[np.int32]:
     """Positions with pixel centres at integers, in fixed point for OpenCV."""
     offsets = (points_mm - np.array(origin_mm)) * np.array([px_per_mm, -px_per_mm]) - 0.5
     points: npt.NDArray[np.int32] = np.round(offsets * _SUBPIXELS).astype(np.int32)
@@ -116,7 +116,7 @@ def _subpixels(points_mm: FloatArray, px_per_mm: float, origin_mm: tuple[float, 
 
 def _fill(
     image: Image,
-    contours: list[FloatArray],
+    contours: list[Floats],
     bgr: tuple[int, ...],
     px_per_mm: float,
     origin_mm: tuple[float, float],
@@ -487,7 +487,7 @@ def _merged_rings(parts: list[Part]) -> list[list[tuple[float, float]]]:
     return [_ring(shapely.get_coordinates(ring)) for area in merged for ring in (area.exterior, *area.interiors)]
 
 
-def _ring(points: FloatArray) -> list[tuple[float, float]]:
+def _ring(points: Floats) -> list[tuple[float, float]]:
     return [(x, y) for x, y in np.round(points[:-1], 6).tolist()]
 
 

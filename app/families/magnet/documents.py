@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 from typing_extensions import TypedDict
 
@@ -16,6 +16,7 @@ from app.markers.magnet_design import Meaning
 from app.markers.reading import Check
 from app.planning.magnet_checks import Site
 from app.registry.marker_rows import MarkerRow
+from app.values import JsonObject
 
 
 class MeaningDocument(StoredMeaning):
@@ -160,7 +161,7 @@ def magnet_detail(row: MarkerRow, sheet: DrillingSheet) -> MagnetDetailDocument:
     }
 
 
-def _hole_document(hole: dict[str, Any]) -> HoleDocument:
+def _hole_document(hole: JsonObject) -> HoleDocument:
     """A hole of the drilling sheet's GeoJSON as a flat document."""
     lon_deg, lat_deg = hole["geometry"]["coordinates"]
     properties = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from itertools import pairwise
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import orjson
 from pydantic import ConfigDict, Field, JsonValue, model_validator
@@ -23,6 +23,7 @@ from app.markers.reading import Check
 from app.planning.magnet_checks import Neighbour, Site, drilling_sheet
 from app.registry.marker_rows import MarkerRow
 from app.roads.lane_line import LaneLine
+from app.values import JsonObject
 
 # === Requests that register magnet markers.
 
@@ -213,7 +214,7 @@ class MagnetSpec(TypedDict):
     meaning: StoredMeaning | None
     lane: StoredLane
     place: dict[str, float | None]  # of `TagPlace` or `LinePlace`
-    site: dict[str, Any]  # of `Site`
+    site: JsonObject  # of `Site`
     neighbours: list[StoredNeighbour]
 
 

@@ -42,7 +42,6 @@ from app.families.surveys import (
     RETIRED,
     ColumnValues,
     Commitment,
-    Flags,
     MarkerRules,
     PlannedRow,
     RowCodes,
@@ -72,6 +71,7 @@ from app.registry.bulk_load import Columns
 from app.registry.marker_rows import CodeRow, MarkerRow
 from app.registry.spatial import distance_m
 from app.surveys.georeference import GeoreferencedSurvey
+from app.values import Bools
 
 # === Schemas of requests that register plates.
 
@@ -454,7 +454,7 @@ def _read_id_codes(survey: GeoreferencedSurvey, rows: Rows, geometry: PlateGeome
     return codes, faults
 
 
-def _draw(codes: RowCodes, wanted: Flags, n: int) -> None:
+def _draw(codes: RowCodes, wanted: Bools, n: int) -> None:
     """Give rows random numbers, again where they are too like a decimal number or somebody else's in the file."""
     for _ in range(_REDRAWS):
         count = int(wanted.sum())

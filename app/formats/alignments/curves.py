@@ -9,12 +9,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from app.errors import UnreadableUpload
-from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_VERTICES, Floats
-
-Ints = npt.NDArray[np.int64]
+from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_VERTICES
+from app.values import Floats, Ints
 
 MAX_STEP_M = 2.0
 """Greatest distance between vertices along the reference line. [m] Values that the file gives as polynomials, such as

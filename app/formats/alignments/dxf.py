@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from app.errors import UnreadableUpload
 from app.formats.alignments.features import (
@@ -34,8 +33,7 @@ from app.formats.alignments.features import (
 from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_VERTICES, AlignmentFile
 from app.formats.surveys.declaration import FEET, METRES
 from app.formats.surveys.dxf_reader import open_dxf, reading_dxf
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 NAME_DISTANCE_M = 10.0
 """Farthest distance of a text from the line that it names. [m] Three lane widths."""

@@ -28,8 +28,7 @@ from app.formats.alignments.geometry import (
     EventKind,
     LaneGeometry,
 )
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 AREA_KINDS = ("joints", "manholes", "crossings", "bridges")
 """Areas that are recognized by a line's or an area's kind; areas may have other kinds too. Source: issue 13."""

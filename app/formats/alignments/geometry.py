@@ -10,12 +10,10 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-import numpy.typing as npt
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 MAX_VERTICES = 2_000_000
 """Vertices of all lines of a file at most. 1,000 km at 0.5 m."""

@@ -14,7 +14,6 @@ from app.errors import ReferenceSystemError, UnreadableUpload
 from app.formats.alignments.curves import GAP_WARNING_M as GAP_M
 from app.formats.alignments.curves import (
     Curve,
-    Ints,
     Piece,
     Profile,
     VerticalPoint,
@@ -24,9 +23,10 @@ from app.formats.alignments.curves import (
     report_gap,
     sample,
 )
-from app.formats.alignments.geometry import MAX_VERTICES, AlignmentFile, Floats, LaneGeometry, StationEquation
+from app.formats.alignments.geometry import MAX_VERTICES, AlignmentFile, LaneGeometry, StationEquation
 from app.formats.xml_tree import attribute, finite_number, parse_xml
 from app.geodesy import reference_system
+from app.values import Floats, Ints
 
 UNITS_M = {
     "millimeter": 0.001, "centimeter": 0.01, "meter": 1.0, "kilometer": 1000.0, "inch": 0.0254, "foot": 0.3048,

@@ -19,11 +19,11 @@ from app.formats.alignments.geometry import (
     BoundaryStyle,
     EventGeometry,
     EventKind,
-    Floats,
     LaneGeometry,
 )
 from app.formats.xml_tree import finite_number, parse_xml
 from app.markers.magnet_design import Arrow
+from app.values import Floats
 
 # === Nodes, ways and relations of an OSM file, as lanelet2 stores its maps.
 

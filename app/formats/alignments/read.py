@@ -18,13 +18,13 @@ from app.formats.alignments.geometry import (
     AlignmentFile,
     BoundaryStyle,
     EarlierTransformation,
-    Floats,
     LaneGeometry,
     StationEquation,
 )
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
 from app.roads.axis import Axis
 from app.roads.lane_line import CalibrationPoint, Measures, calibrate, cut_edges, parallel_line
+from app.values import Floats, JsonObject
 
 # === Roads as GeoJSON (RFC 7946): lines are lanes or their boundaries, points are events, polygons are areas to avoid.
 
@@ -97,7 +97,7 @@ def _geometries(geometry: Any, where: str, level: int = 0) -> Iterator[tuple[Sha
             raise _unreadable(f"{where} has a geometry of type {kind[:40]!r}")
 
 
-def _crs(document: dict[str, object], features: list[object], defaults: dict[str, Any]) -> str | None:
+def _crs(document: dict[str, object], features: list[object], defaults: JsonObject) -> str | None:
     """The one CRS that the file states, as GeoJSON 2008 did and QGIS does, or as a property of the collection."""
     stated = {name for one in (document, *features) if (name := _old_crs(one)) is not None}
     if isinstance(defaults.get("crs"), str):

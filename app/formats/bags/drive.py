@@ -30,6 +30,7 @@ from app.formats.video_file import (
     find_time_gaps,
 )
 from app.sensors.pose_track import PoseTrack
+from app.values import Floats
 
 # === Pictures of bags: compressed ones, and raw ones with their rows of bytes.
 
@@ -86,7 +87,6 @@ def _check_raw(message: Any) -> tuple[int, int | None]:
 # === Magnetic fields and speeds of a bag: one topic for each magnetometer, with the times of the messages' headers.
 
 
-Floats = npt.NDArray[np.float64]
 FIELDS = types_of("sensor_msgs", "MagneticField")
 _SPEEDS: dict[str, Callable[[Any], float]] = {
     **dict.fromkeys(types_of("geometry_msgs", "TwistStamped"), lambda m: m.twist.linear.x),

@@ -21,7 +21,6 @@ from app.formats.surveys.table import (
     Change,
     Detected,
     Fault,
-    Floats,
     NumberForm,
     Severity,
     SourceTable,
@@ -34,6 +33,7 @@ from app.formats.surveys.table import (
 )
 from app.geodesy import reference_system
 from app.geodesy.systems import best_effort
+from app.values import Floats, JsonObject
 
 # === Grids of projected systems: their unit, and eastings that begin with the number of the zone.
 
@@ -80,7 +80,7 @@ def zone_numbers(system: CRS) -> tuple[int, ...]:
     """
     if not system.is_projected or crs_unit(system) != "m" or system.coordinate_operation is None:
         return ()
-    values: dict[str, Any] = {parameter.name: parameter.value for parameter in system.coordinate_operation.params}
+    values: JsonObject = {parameter.name: parameter.value for parameter in system.coordinate_operation.params}
     if "Transverse Mercator" not in system.coordinate_operation.method_name:
         return ()
     if values.get("False easting") != _FALSE_EASTING_M:

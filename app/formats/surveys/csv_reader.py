@@ -21,7 +21,6 @@ from app.formats.surveys.table import (
     Detected,
     Fault,
     Faults,
-    Floats,
     NumberForm,
     SourceTable,
     Texts,
@@ -31,6 +30,7 @@ from app.formats.surveys.table import (
 from app.formats.text import SPACES, as_utf8, detect_delimiter, repeated_names, split_rows
 from app.geodesy import normalize_crs, reference_system
 from app.geodesy.systems import best_effort, covers
+from app.values import Floats
 
 # === Where the rows of delimited text begin, and what their columns are: by a header, or by position.
 

@@ -35,7 +35,6 @@ from app.formats.surveys.table import (
     Detected,
     Fault,
     Faults,
-    Floats,
     Severity,
     SourceTable,
     SurveyTable,
@@ -45,6 +44,7 @@ from app.formats.surveys.table import (
 )
 from app.formats.text import guess_encoding
 from app.geodesy import normalize_crs, reference_system
+from app.values import Floats
 
 # === Surveys as GeoJSON (RFC 7946).
 

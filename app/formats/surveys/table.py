@@ -10,10 +10,8 @@ from enum import StrEnum
 from typing import Any, NamedTuple, overload
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from app.values import Bools, Floats
 
 MAX_ROWS = 1_000_000
 MAX_COLUMNS = 256
@@ -115,7 +113,7 @@ class Faults:
                 if row <= len(flags):
                     flags[row - 1] = 0
 
-    def flags(self, rows: int, severity: Severity) -> Flags:
+    def flags(self, rows: int, severity: Severity) -> Bools:
         """Which of the first `rows` rows have a fault of this severity, shape (rows,)."""
         flags = np.zeros(rows, dtype=bool)
         known = np.frombuffer(bytes(self._rows[severity]), dtype=bool)[:rows]

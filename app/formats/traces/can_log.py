@@ -18,8 +18,7 @@ from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, Up
 from app.formats.text import is_clean_text, require_columns
 from app.formats.traces.declaration import CanDeclaration, CanSignal, TraceLimits, TraceReport
 from app.formats.traces.parts import Part, Series
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 _DEFECTS = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, AssertionError, EOFError, OSError, OverflowError,

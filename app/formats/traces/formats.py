@@ -25,8 +25,7 @@ from app.formats.traces.declaration import (
 from app.formats.traces.parts import Part, Series
 from app.formats.traces.tables import Table, read_csv, read_parquet, read_raw_data, read_raw_series
 from app.formats.traces.wire import StreamReader
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 _CAN_SUFFIXES = (".asc", ".blf", ".trc", ".log")
 _TEXT_SUFFIXES = (".csv", ".txt", ".dbc", ".asc", ".trc", ".log", ".json", ".xlsx", ".mf4", ".mat")

@@ -24,6 +24,7 @@ from app.formats.traces.declaration import (
     TraceLimits,
     TraceReport,
 )
+from app.values import Floats
 
 BLOCK_BYTES = 4 * 1024**2
 """Bytes that are read at a time. Bounds the memory."""
@@ -161,8 +162,6 @@ def _printable(name: str) -> str:
 
 # === Rising times, plausible speeds and headings, gaps.
 
-
-Floats = npt.NDArray[np.float64]
 
 MAX_SPEED_M_S = 100.0
 """Largest plausible speed of a vehicle. [m/s] 360 km/h."""

@@ -34,11 +34,10 @@ from app.formats.traces.parts import (
     rising_rows,
 )
 from app.sensors.magnetometer_bar import MAX_FIELD_UT, MagnetTrace
+from app.values import Floats, Floats32
 
 # === From recorded numbers to microtesla in vehicle axes, and whether the declared unit is plausible.
 
-
-Field = npt.NDArray[np.float32]
 
 EARTH_UT = (15.0, 75.0)
 """Plausible magnitudes of the field at calibrated sensors. [uT] Source: the earth's field at the surface is 22 to 67 uT
@@ -51,9 +50,9 @@ _VEHICLE_FROM: dict[AxisConvention, tuple[int, int, int]] = {"ISO8855": (1, 1, 1
 
 
 def convert_field(
-    field: Field, part: str, declaration: TraceDeclaration, metro: bool, report: TraceReport,
+    field: Floats32, part: str, declaration: TraceDeclaration, metro: bool, report: TraceReport,
     known_unit: FieldUnit | None = None,
-) -> Field:  # fmt: skip
+) -> Floats32:  # fmt: skip
     """Recorded values as microtesla in ISO 8855; what is damaged becomes NaN. Changes its input.
 
     Raises
@@ -98,7 +97,7 @@ def convert_field(
     return field
 
 
-def _check_unit(field: Field, part: str, unit: FieldUnit, declaration: TraceDeclaration) -> None:
+def _check_unit(field: Floats32, part: str, unit: FieldUnit, declaration: TraceDeclaration) -> None:
     """Refuse a unit in which the earth's field, which every magnetometer sees, would be impossible."""
     if declaration.background_removed:
         return
@@ -128,7 +127,7 @@ def _check_unit(field: Field, part: str, unit: FieldUnit, declaration: TraceDecl
     )
 
 
-def _warn_dead_sensors(field: Field, part: str, report: TraceReport) -> None:
+def _warn_dead_sensors(field: Floats32, part: str, report: TraceReport) -> None:
     some = field[:: max(len(field) // _CHECKED, 1)]
     for i in range(field.shape[1]):
         values = some[:, i]
@@ -141,8 +140,6 @@ def _warn_dead_sensors(field: Field, part: str, report: TraceReport) -> None:
 
 # === The files of one recording and what is declared of them, to one trace and a report.
 
-
-Floats = npt.NDArray[np.float64]
 
 _EPOCH_S = 1e6  # [s] a first time above this counts from some epoch, so the trace starts at 0; 11 days
 _MISSING_SPEED_CURE = "send the recorder's RawSpeed file, a CAN log or a speed column, or declare a constant speed"

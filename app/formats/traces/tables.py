@@ -28,11 +28,10 @@ from app.formats.traces.declaration import (
     TraceReport,
 )
 from app.formats.traces.parts import Part
+from app.values import Floats
 
 # === Columns of numbers from the CSV files of a recording.
 
-
-Floats = npt.NDArray[np.float64]
 
 _MAX_COLUMNS = 4096
 _MAX_LINE_WITHOUT_END = 4096  # [character] a longer beginning without a line end is no header

@@ -15,9 +15,7 @@ import numpy.typing as npt
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.formats.traces.declaration import TraceGap, TraceLimits, TraceReport
 from app.sensors.magnetometer_bar import MAX_FIELD_UT
-
-Words = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+from app.values import Floats, Floats32
 
 _NEAR_UT = 100.0  # [uT] change of half of the fields, at most; the earth's field turned round
 _RATES_HZ = (80.0, 1000.0)  # [Hz] median rates of a stream; around the 350 Hz of METRO section 6.1
@@ -59,7 +57,7 @@ class StreamReader:
         self._bytes = 4 * self._words
         low, high = (rate_hz / 1.4, rate_hz * 1.4) if rate_hz else _RATES_HZ
         self._medians_us = (1e6 / high, 1e6 / low)
-        self._kept: list[Words] = []
+        self._kept: list[Floats32] = []
         self._intervals: list[Floats] = []
         self._lost: list[tuple[int, float, int]] = []  # sample after the gap, samples lost, bytes skipped
         self._count = 0
@@ -106,11 +104,11 @@ class StreamReader:
         )
         return self._assemble(interval_extra_us)
 
-    def _samples(self, position: int, count: int) -> Words:
+    def _samples(self, position: int, count: int) -> Floats32:
         flat = np.frombuffer(self._data, "<f4", count * self._words, position)
         return flat.reshape(count, self._words)
 
-    def _sample_status(self, samples: Words, sync: _Sync) -> npt.NDArray[np.int8]:
+    def _sample_status(self, samples: Floats32, sync: _Sync) -> npt.NDArray[np.int8]:
         """Status of samples: good, good but for the interval, or bad where none begins here."""
         with np.errstate(invalid="ignore", over="ignore"):
             fields, interval = samples[:, :-1], samples[:, -1]
@@ -150,7 +148,7 @@ class StreamReader:
         return position
 
     def _take(
-        self, samples: Words, taken: npt.NDArray[np.intp], status: npt.NDArray[np.int8], end: int, sync: _Sync
+        self, samples: Floats32, taken: npt.NDArray[np.intp], status: npt.NDArray[np.int8], end: int, sync: _Sync
     ) -> None:
         if self._count + taken.size > self._limits.rows:
             raise UploadTooLarge(
@@ -291,7 +289,7 @@ class StreamReader:
                 found.append((phase, sync, whole))
         return found
 
-    def _holds_interval(self, samples: Words, middle: Floats) -> bool:
+    def _holds_interval(self, samples: Floats32, middle: Floats) -> bool:
         """Whether a word among the fields counts whole microseconds, as intervals do."""
         with np.errstate(invalid="ignore"):
             whole = (samples == np.round(samples)).mean(0) >= 0.8

@@ -12,10 +12,10 @@ import scipy
 
 from app.errors import InvalidParameter
 from app.geodesy.frames import ecef_from_wgs84
-from app.planning.alignment import Floats as AlignmentFloats
 from app.planning.alignment import Lane, format_station
 from app.planning.placement.place import MIN_SPACING_M, path_error_m
 from app.planning.rules import Quality
+from app.values import Floats
 
 # === Even distances along a lane.
 
@@ -25,12 +25,12 @@ def replace_every(quality: Quality, fix_every_m: float) -> Quality:
     return quality.model_copy(update={"fix_every_m": fix_every_m})
 
 
-def middles(lane: Lane, step_m: float) -> AlignmentFloats:
+def middles(lane: Lane, step_m: float) -> Floats:
     """Middles of equal parts of a lane of at most a step. [m]"""
     return even_places(lane, max(math.ceil(lane.length_m / step_m - 1e-9), 1))
 
 
-def even_places(lane: Lane, count: int) -> AlignmentFloats:
+def even_places(lane: Lane, count: int) -> Floats:
     """Middles of so many equal parts of a lane, shape (count,). [m]"""
     return np.asarray((np.arange(count) + 0.5) * lane.length_m / max(count, 1))
 
@@ -38,7 +38,6 @@ def even_places(lane: Lane, count: int) -> AlignmentFloats:
 # === Exact solvers for places along one line.
 
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 _SECTION_WINDOWS = 8.0
@@ -313,7 +312,7 @@ _LITTLE = 0.6  # share of the error below which a gap may become longer
 
 def fewest_pairs(
     lane: Lane, max_error_m: float, *, max_spacing_m: float, allowed: npt.NDArray[np.bool_] | None = None
-) -> AlignmentFloats:
+) -> Floats:
     """Chainages of the fewest pairs found with which a cubic spline stays within an error.
 
     Parameters
@@ -370,7 +369,7 @@ def fewest_pairs(
     return best
 
 
-def even_pairs(lane: Lane, max_error_m: float, *, max_spacing_m: float) -> AlignmentFloats:
+def even_pairs(lane: Lane, max_error_m: float, *, max_spacing_m: float) -> Floats:
     """Chainages of the fewest pairs at even distances that stay within an error, both ends among them, shape (K,). [m]
 
     Raises
@@ -400,7 +399,7 @@ def even_pairs(lane: Lane, max_error_m: float, *, max_spacing_m: float) -> Align
     return np.linspace(0.0, lane.length_m, count + 1)
 
 
-def _gap_errors_m(lane: Lane, max_spacing_m: float) -> AlignmentFloats:
+def _gap_errors_m(lane: Lane, max_spacing_m: float) -> Floats:
     """Distance of the lane from the cubic curve between two samples, shape (steps, N); NaN beyond the end. [m]
 
     Row k is for gaps of k + 1 steps; it is at least that of every shorter gap from the same sample.
@@ -427,7 +426,7 @@ def _gap_errors_m(lane: Lane, max_spacing_m: float) -> AlignmentFloats:
 
 def _even_if_allowed(
     lane: Lane, max_error_m: float, max_spacing_m: float, allowed: npt.NDArray[np.bool_]
-) -> AlignmentFloats | None:
+) -> Floats | None:
     """Pairs at even distances, None where they are not enough or not allowed."""
     try:
         pairs = even_pairs(lane, max_error_m, max_spacing_m=max_spacing_m)
@@ -436,9 +435,7 @@ def _even_if_allowed(
     return pairs if allowed[np.rint(pairs / lane.step_m).astype(np.intp)[1:-1]].all() else None
 
 
-def _reach(
-    lane: Lane, errors: AlignmentFloats, limits: AlignmentFloats, allowed: npt.NDArray[np.bool_], max_spacing_m: float
-) -> AlignmentFloats:
+def _reach(lane: Lane, errors: Floats, limits: Floats, allowed: npt.NDArray[np.bool_], max_spacing_m: float) -> Floats:
     """Chainages of pairs, each as far from the one before as the limits allow, but at least 2 m; both ends. [m]"""
     possible = np.nan_to_num(errors, nan=np.inf) <= limits
     steps = possible.sum(axis=0)
@@ -469,7 +466,7 @@ def _nearest_allowed(lane: Lane, allowed: npt.NDArray[np.bool_], chainage_m: flo
     return float(lane.chainage_m[k + after[0]]) if len(after) else lane.length_m
 
 
-def _worst_of_gaps(lane: Lane, pairs: AlignmentFloats) -> tuple[AlignmentFloats, npt.NDArray[np.intp], float]:
+def _worst_of_gaps(lane: Lane, pairs: Floats) -> tuple[Floats, npt.NDArray[np.intp], float]:
     """Greatest path error of each gap [m], the gap of each sample, and the chainage of the greatest error [m]."""
     error = path_error_m(lane, pairs)
     gap = np.clip(np.searchsorted(pairs, lane.chainage_m, side="right") - 1, 0, len(pairs) - 2)
@@ -478,9 +475,7 @@ def _worst_of_gaps(lane: Lane, pairs: AlignmentFloats) -> tuple[AlignmentFloats,
     return worst, gap, float(lane.chainage_m[np.argmax(error)])
 
 
-def _halved(
-    lane: Lane, pairs: AlignmentFloats, wrong: npt.NDArray[np.bool_], allowed: npt.NDArray[np.bool_]
-) -> AlignmentFloats:
+def _halved(lane: Lane, pairs: Floats, wrong: npt.NDArray[np.bool_], allowed: npt.NDArray[np.bool_]) -> Floats:
     """With a pair more in the middle of each wrong gap that is long enough and where it may stand."""
     middles = ((pairs[:-1] + pairs[1:]) / 2)[wrong & (np.diff(pairs) >= 2 * MIN_SPACING_M)]
     middles = middles[allowed[np.rint(middles / lane.step_m).astype(np.intp)]]

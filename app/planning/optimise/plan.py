@@ -11,7 +11,7 @@ import numpy as np
 
 from app.errors import InvalidParameter
 from app.markers.plate import PlateGeometry
-from app.planning.alignment import Alignment, Floats, Lane, format_station
+from app.planning.alignment import Alignment, Lane, format_station
 from app.planning.optimise.cover import (
     cheapest_cover,
     even_pairs,
@@ -28,6 +28,7 @@ from app.planning.placement.sites import AvoidedAreas, covered_by_tags_m, place_
 from app.planning.plan import PlannedMarker, PlannedPlate, PlannedTag, Purpose, TradeOffPoint
 from app.planning.predict.rates import plate_fix_error_m, plate_rates, tag_fix_error_m, tag_fix_share, tag_rates
 from app.planning.rules import PlanRules, Quality, marking_rules
+from app.values import Floats
 
 # === Costs of sites by the agency's unit costs.
 

@@ -11,7 +11,7 @@ import scipy
 
 from app.formats.alignments.geometry import BoundaryStyle, EventKind
 from app.geodesy.frames import metres_per_radian
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.outputs.hd_map import (
     HdMap,
     MapMarker,
@@ -21,6 +21,7 @@ from app.planning.outputs.hd_map import (
     refine_breaks,
     speed_kmh,
 )
+from app.values import Floats
 
 PIECE_M = 40.0
 """Length of a lanelet along the road's reference line; 50 m at most in bends too. [m] Source: TIER IV's convention of 1

@@ -14,8 +14,9 @@ import scipy
 
 from app.geodesy.frames import ecef_from_wgs84
 from app.markers.cerpm import LaneSide
-from app.planning.alignment import Alignment, Floats, Lane, RoadEvent
+from app.planning.alignment import Alignment, Lane, RoadEvent
 from app.planning.plan import Plan, PlannedCerpm, PlannedMarker, PlannedPlate, PlannedTag
+from app.values import Floats
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # source: XML 1.0, section 2.2
 _PLAIN = re.compile("[-+., /0-9:A-Z_a-z]*")

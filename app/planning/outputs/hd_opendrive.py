@@ -13,8 +13,9 @@ from pyproj import Proj
 
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import BoundaryStyle
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.outputs.hd_map import HdMap, MapMarker, attribute, number, refine_breaks
+from app.values import Floats
 
 # === A lane's centre line as cubic curves, with profiles along it: what OpenDRIVE calls a road's reference line.
 

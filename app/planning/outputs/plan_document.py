@@ -15,7 +15,7 @@ from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import BoundaryStyle, StationEquation
 from app.markers.cerpm import HEIGHT_M, KEY_BYTES, CerpmMessage, LaneSide
 from app.markers.magnet_design import Codebook
-from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent, format_station
+from app.planning.alignment import Alignment, AvoidedArea, Lane, RoadEvent, format_station
 from app.planning.plan import (
     Detail,
     LeftOut,
@@ -31,6 +31,7 @@ from app.planning.plan import (
 from app.planning.plan_checks.families import radio_settings
 from app.planning.rules import PlanRules
 from app.radio.settings import RadioSettings
+from app.values import Floats, JsonObject
 
 PLAN_FORMAT = "waymark-plan/1"
 MAX_PLAN_BYTES = 500_000_000
@@ -257,7 +258,7 @@ def write_plan_geojson(plan: Plan) -> bytes:
     return orjson.dumps(document)
 
 
-def marker_feature(plan: Plan, marker: PlannedMarker) -> dict[str, Any]:
+def marker_feature(plan: Plan, marker: PlannedMarker) -> JsonObject:
     """One marker as a GeoJSON feature."""
     road = plan.alignment
     height = marker.height_m if road.vertical_datum == "ellipsoid" else None  # RFC 7946, section 3.1.1

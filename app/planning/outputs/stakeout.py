@@ -21,10 +21,11 @@ from app.errors import InvalidParameter
 from app.formats.surveys.coordinates import crs_unit
 from app.formats.surveys.declaration import METRES
 from app.geodesy import normalize_crs, reference_system
-from app.geodesy.place import Floats, Origin, SystemPositions, positions_in_system
+from app.geodesy.place import Origin, SystemPositions, positions_in_system
 from app.planning.alignment import format_station
 from app.planning.outputs.plan_document import marker_feature
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
+from app.values import Floats
 
 # === Points that a crew stakes: one a marker, one a magnet of a tag, in the crew's reference system and unit.
 

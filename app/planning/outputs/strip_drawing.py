@@ -12,7 +12,7 @@ import shapely
 
 from app.encoders.pdf import POINTS_PER_MM
 from app.formats.alignments.geometry import BoundaryStyle, EventKind, StationEquation
-from app.planning.alignment import Alignment, Floats, RoadEvent, format_station
+from app.planning.alignment import Alignment, RoadEvent, format_station
 from app.planning.outputs.drawing_sheet import (
     BLACK,
     BLUE,
@@ -29,6 +29,7 @@ from app.planning.outputs.drawing_sheet import (
 )
 from app.planning.outputs.strip_layout import ROW_MM, SCALES, LanePiece, Strip
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
+from app.values import Floats
 
 ROW_HEIGHT_MM = 78.0
 """Height of a row with its heading. [mm] Source: three rows above the title block of A3."""

@@ -11,8 +11,9 @@ import scipy
 
 from app.errors import InvalidParameter
 from app.geodesy.frames import ecef_from_wgs84, metres_per_radian
-from app.planning.alignment import Alignment, Floats, Lane
+from app.planning.alignment import Alignment, Lane
 from app.planning.plan import Plan
+from app.values import Floats
 
 Indices = npt.NDArray[np.intp]
 

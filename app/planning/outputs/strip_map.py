@@ -12,7 +12,7 @@ import shapely
 from app.markers.cerpm import LaneSide
 from app.markers.magnet import Polarity
 from app.markers.reading import Verdict
-from app.planning.alignment import Floats, format_station
+from app.planning.alignment import format_station
 from app.planning.outputs.bill import counts_sentence, finding_figures, verdict_counts
 from app.planning.outputs.drawing_sheet import (
     BLACK,
@@ -39,6 +39,7 @@ from app.planning.outputs.drawing_sheet import (
 from app.planning.outputs.strip_drawing import ROW_HEIGHT_MM, StripDrawing, StripPlace
 from app.planning.outputs.strip_layout import Strip, cut_strips
 from app.planning.plan import Plan
+from app.values import Floats
 
 MAX_SHEETS = 100
 """Sheets of one file; more become several files. What a viewer opens at once."""

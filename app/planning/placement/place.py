@@ -21,7 +21,7 @@ from app.markers.cerpm import MAX_SPEED_LIMIT, LaneSide, SpeedLimit
 from app.markers.magnet import InformationTag, LineTag, Polarity
 from app.markers.magnet_design import Codebook, Meaning, TagDesign
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
-from app.planning.alignment import Alignment, Floats, Lane
+from app.planning.alignment import Alignment, Lane
 from app.planning.placement.sites import AvoidedAreas, Boundaries, Site, place_line_magnets, place_plates, place_tags
 from app.planning.plan import (
     Detail,
@@ -35,6 +35,7 @@ from app.planning.plan import (
     Purpose,
 )
 from app.planning.rules import CerpmRules, PlanRules, PlateRules, TagRules, marking_rules
+from app.values import Floats
 
 # === Codes of a plan's markers: unused registry numbers, and tags of one codebook.
 

@@ -17,9 +17,10 @@ from app.geodesy.frames import ecef_from_wgs84
 from app.markers.cerpm import LaneSide
 from app.markers.magnet import MIN_GAP_M
 from app.markers.magnet_design import Meaning, MeaningKind
-from app.planning.alignment import Alignment, Floats, Lane, RoadEvent
+from app.planning.alignment import Alignment, Lane, RoadEvent
 from app.planning.plan import LeftOut, Purpose
 from app.planning.rules import Ahead, AvoidRules, LineRules, PlanRules, PlateRules, TagRules
+from app.values import Floats
 
 # === Places on lanes before codes are assigned, and the distances ahead of events at which they are.
 

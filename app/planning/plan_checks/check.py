@@ -14,7 +14,7 @@ from app.geodesy.frames import ecef_from_wgs84
 from app.markers.magnet import MIN_GAP_M
 from app.markers.plate import PlateGeometry
 from app.markers.reading import Verdict
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.optimise.cover import window_rows
 from app.planning.optimise.plan import marker_fixes
 from app.planning.outputs.bill import plan_bill
@@ -29,6 +29,7 @@ from app.planning.plan import (
 )
 from app.planning.plan_checks.families import check_cerpms, check_magnets, check_plates, compare, radio_settings
 from app.planning.predict.rates import line_rates, path_errors_m, plate_rates, tag_rates
+from app.values import Floats
 
 # === Predicted read rates of each family and path errors, in the circumstances that the rules name.
 

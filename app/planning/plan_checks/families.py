@@ -17,7 +17,7 @@ from app.geodesy.frames import ecef_from_wgs84
 from app.markers.magnet import MAX_LINE_SPACING_M, MIN_GAP_M
 from app.markers.plate import PlateGeometry, PlateScheme, plate_capacity
 from app.markers.reading import Verdict
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.magnet_checks import HALF_BAR_M, READABLE_CLEARANCE_M, vehicle_clearances
 from app.planning.placement.place import path_error_m
 from app.planning.placement.sites import distance_ahead_m
@@ -45,6 +45,7 @@ from app.radio.reception import MAX_MARKERS, SPACINGS_M, Air, RoadMarkers
 from app.radio.regulation import LAWS, region_at
 from app.radio.settings import SPREADING_FACTORS, RadioSettings, Region
 from app.sensors.camera import Camera
+from app.values import Floats
 
 # === Findings at the place where they are worst.
 

@@ -42,6 +42,7 @@ from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, Drive, drive_over_plate
 from app.simulation.plate_face import Face, plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene, face_truth
+from app.values import Floats
 
 WHITE_REFLECTANCE = 0.75
 """[1] assumed for the plate's white, which a photo does not show. Source: `PlateLook.light`."""
@@ -55,8 +56,6 @@ _SHIFTS = np.linspace(0.0, MAX_SHIFT, 35)  # at which the likelihood is computed
 _GRAIN = 0.03  # of the asphalt; source: middle of `_GRAIN` of app/planning/proof/plates.py
 _NEIGHBOURS_DEG = (-0.00036, -0.00018, 0.00018, 0.00036)  # [deg] 20 and 40 m; a dense road
 _NEAR_NUMBERS = (-2, -1, 1, 2)
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,11 +17,12 @@ import scipy
 
 from app.errors import InvalidParameter
 from app.markers.plate import PlateGeometry
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.placement.place import one_of_each_pair, path_error_m
 from app.planning.plate_view import camera_of, project_road, unit_heights_px
 from app.planning.rules import CameraRules, PredictionRules
 from app.sensors.camera import Camera
+from app.values import Floats
 
 # === Models of read rates and path errors, and their fitted parameters of app/planning/data/predictions.json.
 

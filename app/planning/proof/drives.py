@@ -21,7 +21,7 @@ from app.lanes.estimate import Lane as LanePathEstimate
 from app.lanes.estimate import LaneMarkers, fit_lane
 from app.markers.cerpm import DEGREE_STEP, CerpmMessage, LaneSide, derive_marker_key
 from app.markers.magnet import Orientation
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.plan import PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedTag
 from app.planning.proof.report import LanePath, MarkerPass, WrongReading
 from app.radio.settings import RadioSettings
@@ -30,6 +30,7 @@ from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, tag_magnet
 from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_past
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, lane_from_wgs84
 from app.simulation.radio.link import Radio
+from app.values import Floats
 
 # === A drive past the CERPMs of a stretch of lane: packets, the path that follows from them, and its errors.
 

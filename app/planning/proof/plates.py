@@ -19,7 +19,7 @@ from app.decoders.plate.reader import decode_plates
 from app.geodesy import enu_from_heading, enu_from_wgs84, wgs84_from_enu
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.plan import PlannedMarker, PlannedPlate
 from app.planning.proof.report import Condition, MarkerPass, WrongReading
 from app.planning.rules import CameraRules
@@ -37,6 +37,7 @@ from app.simulation.conditions import (
 )
 from app.simulation.plate_face import PlateWear, plate_face
 from app.simulation.plate_scene import Air, PlateScene, Shadow, face_truth
+from app.values import Floats
 
 # === Light, weather, camera and state of a plate in a simulated drive.
 

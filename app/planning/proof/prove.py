@@ -15,7 +15,7 @@ import scipy
 from app.errors import InvalidParameter
 from app.geodesy.frames import ecef_from_wgs84
 from app.markers.plate import PlateCode
-from app.planning.alignment import Floats, Lane
+from app.planning.alignment import Lane
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
 from app.planning.plan_checks.families import radio_settings
 from app.planning.plate_view import camera_of
@@ -48,6 +48,7 @@ from app.planning.proof.report import (
 from app.radio.settings import RadioSettings
 from app.simulation.conditions import Conditions
 from app.simulation.radio.link import Radio
+from app.values import Floats
 
 # === Markers of a plan beside a lane, whatever lane they were placed for.
 

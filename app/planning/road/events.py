@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from app.errors import InvalidParameter
@@ -14,8 +13,7 @@ from app.formats.alignments.geometry import AlignmentFile, EventGeometry, EventK
 from app.planning.alignment import Lane, RoadEvent
 from app.planning.road.ground_line import steps_m
 from app.planning.rules import RoadRules
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 REACH_M = 15.0
 """Farthest distance of an event from its lane. [m] Signs stand beside four lanes."""

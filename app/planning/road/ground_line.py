@@ -12,8 +12,8 @@ import scipy
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_COORDINATE
 from app.geodesy.frames import metres_per_radian
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 MAX_LANES_M = 500_000.0

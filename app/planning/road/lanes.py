@@ -32,11 +32,10 @@ from app.planning.road.ground_line import (
 )
 from app.planning.road.reference import local_plane
 from app.planning.rules import RoadRules
+from app.values import Floats
 
 # === Checks of lanes: what no vehicle can drive on is refused, with its place and the cure.
 
-
-Floats = npt.NDArray[np.float64]
 
 MIN_RADIUS_M = 4.39
 """Smallest radius of a lane's centre. [m] Source: AASHTO Green Book 2018, table 2-6b, inside radius of the passenger

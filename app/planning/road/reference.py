@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
@@ -18,8 +17,7 @@ from app.formats.surveys.declaration import METRES
 from app.geodesy import normalize_crs, place_positions, reference_system
 from app.geodesy.systems import is_global
 from app.planning.alignment import AlignmentDeclaration
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 MAX_LOCAL_M = 200_000.0
 """Farthest distance of local coordinates from their origin. [m] UTM northings are larger."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Any, cast
+from typing import cast
 
 from app.errors import Conflict, InvalidParameter
 from app.registry import agencies as store
@@ -27,6 +27,7 @@ from app.services.access.audit import (
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.ports import Clock
+from app.values import JsonObject
 
 MAX_LIFETIME = timedelta(days=3653)
 MAX_OVERLAP = timedelta(days=30)
@@ -269,7 +270,7 @@ class Agencies:
         items = [document_of(AgencyDocument, row) for row in rows[:limit]]
         return AgencyPage(items=items), rows[limit - 1].id if len(rows) > limit else None
 
-    def _opened(self, document: dict[str, Any]) -> NewAgencyDocument:
+    def _opened(self, document: JsonObject) -> NewAgencyDocument:
         """A stored response with the text of its key."""
         sealed = base64.b64decode(document["admin_key"]["key"])
         text = self._secrets.unseal(_owner(document["id"]), sealed).decode()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -35,6 +35,7 @@ from app.services.idempotency import IdempotencyKey, find_response
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue
 from app.services.uploads.quotas import Quotas
+from app.values import JsonObject
 
 _WAIT_S = 60.0
 """How long a job waits for a decoder process before it is put back. [s]"""
@@ -123,7 +124,7 @@ class Decodes:
             upload = Upload(job.row.agency_id, author, file, context, row.created_at, wait_s=_WAIT_S, job=job)
             self._path.decode_queued(job, upload, handler)
 
-    def decode_again(self, agency_id: str, decode_id: str) -> tuple[dict[str, Any], bytes | None]:
+    def decode_again(self, agency_id: str, decode_id: str) -> tuple[JsonObject, bytes | None]:
         """The result of a stored upload by the present decoders, and its plot; nothing is stored.
 
         Raises

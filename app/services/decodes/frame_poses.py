@@ -12,7 +12,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from typing_extensions import TypedDict
 
 from app.formats.frame_list import FrameList, ListedFrame
@@ -25,6 +24,7 @@ from app.services.decodes.context import DecodeKind, DecodeTimes, clock_of, stam
 from app.services.decodes.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.services.documents import listed
 from app.tracks.files import gpx_document
+from app.values import Floats
 
 # === Positions of the vehicle's own receiver, as a decode keeps them for the track of its drive.
 
@@ -340,7 +340,6 @@ MAX_STEP_S = 30.0
 MAX_STRAIGHT_S = 3.0
 """[s] before the first and after the last tag for which its heading serves, where the recording has no headings. 36 m
 in a town, less than a bend."""
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

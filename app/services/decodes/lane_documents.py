@@ -6,17 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
-import numpy.typing as npt
 from typing_extensions import TypedDict
 
 from app.lanes.smooth_line import wgs84_from_plane
 from app.lanes.types import Lane, TrackAgreement
 from app.services.documents import document_of, listed
+from app.values import Floats
 
 if TYPE_CHECKING:  # it loads numba
     from app.simulation.steering import SteeringCheck
 
-Floats = npt.NDArray[np.float64]
 LonLat = list[list[float]]
 _STRAIGHT_PER_M = 1e-4
 GeometryType = Literal["LineString", "MultiLineString", "Point"]

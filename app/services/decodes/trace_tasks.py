@@ -25,8 +25,8 @@ from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 from app.services.decoder_tasks import decoder_task
 from app.services.decodes.declarations import DeclaredTrace
 from app.services.documents import listed
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 _RECORDING = ("recording", "cut the recording into shorter ones")
 
 # === Decoding.

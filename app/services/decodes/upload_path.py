@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from functools import partial
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import ClassVar, Generic, Literal, TypeVar
 
 import orjson
 import sqlalchemy as sa
@@ -42,6 +42,7 @@ from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, JobQueue, Pending
 from app.services.uploads.quotas import Quotas
+from app.values import JsonObject
 
 # === What a kind of upload adds.
 
@@ -91,9 +92,9 @@ class Decoded:
     unregistered: Sequence[NewUnregistered] = ()  # markers that were read where none is registered
 
     @property
-    def result(self) -> dict[str, Any]:
+    def result(self) -> JsonObject:
         """The result as JSON values, as it is stored."""
-        stored: dict[str, Any] = orjson.loads(orjson.dumps(self.document, option=orjson.OPT_SERIALIZE_NUMPY))
+        stored: JsonObject = orjson.loads(orjson.dumps(self.document, option=orjson.OPT_SERIALIZE_NUMPY))
         return stored
 
 

@@ -28,6 +28,7 @@ from app.services.access.access import Caller
 from app.services.markers.codebooks import MAX_BOOKS_SEARCHED
 from app.services.ports import Clock
 from app.services.request_work import check_deadline
+from app.values import JsonObject
 
 MAX_HOURS = MAX_VALIDITY / timedelta(hours=1)
 _SAME = ("scheme", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm")
@@ -107,7 +108,7 @@ def read_blocks(connection: sa.Connection, agency_id: str, box: Box, epoch: floa
             yield {**block, **moved, **family.snapshot_members(connection, agency_id, code), "code": code, "kind": kind}
 
 
-def _at_epoch(block: Block, epoch: float) -> dict[str, Any]:
+def _at_epoch(block: Block, epoch: float) -> JsonObject:
     """Columns of a block that change with the position, as `matching.marker_at` moves it to an epoch."""
     names = ("lon_deg", "lat_deg", "epoch", "transform_accuracy_m", "horizontal_rmse_m")
     lon, lat, stated, frame_m, survey_m = (np.array(block[name], dtype=np.float64) for name in names)
@@ -119,7 +120,7 @@ def _at_epoch(block: Block, epoch: float) -> dict[str, Any]:
     total_m = np.hypot(survey_m, np.nan_to_num(frame_m))
     fit = np.array(block["localization_grade"]) != LocalizationGrade.UNFIT
     fit[moves] = total_m[moves] < GRADE_LIMITS_M[LocalizationGrade.M]
-    found: dict[str, Any] = {"lon_deg": lon, "lat_deg": lat, "horizontal_rmse_m": total_m}
+    found: JsonObject = {"lon_deg": lon, "lat_deg": lat, "horizontal_rmse_m": total_m}
     found["localization_grade"] = np.where(fit, "fit", LocalizationGrade.UNFIT)
     for name, shift_deg in shift.items():
         if f"lane_{name}" in block:

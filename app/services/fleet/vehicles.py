@@ -34,6 +34,7 @@ from app.services.fleet.documents import (
 )
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.ports import Clock
+from app.values import JsonObject
 
 # === Sensor profiles: the part of a decode's context that stays the same from upload to upload.
 #
@@ -65,7 +66,7 @@ PROFILE_EXAMPLE: dict[str, JsonValue] = {
     },
 }  # fmt: skip
 
-Object = dict[str, Any]
+Object = JsonObject
 
 
 class VehicleCamera(CameraDeclaration):

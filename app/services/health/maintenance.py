@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal, NotRequired
+from typing import Literal, NotRequired
 
 import orjson
 import sqlalchemy as sa
@@ -33,6 +33,7 @@ from app.services.access.audit import author_of
 from app.services.documents import document_of
 from app.services.markers.markers import MarkerChange, Markers
 from app.services.ports import Clock
+from app.values import JsonObject
 
 # === The work list and the state of a marker's tests as clients see them.
 
@@ -291,7 +292,7 @@ def open_reported_item(
 
 def _new_item(
     subject: str, decode_id: str | None, what: str, marker: MarkerRow | None, reading: NewUnregistered | None,
-    figures: dict[str, Any], now: datetime,
+    figures: JsonObject, now: datetime,
 ) -> ItemRow:  # fmt: skip
     place = marker if marker is not None else reading
     assert place is not None

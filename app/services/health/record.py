@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from statistics import median
-from typing import Any
 
 import sqlalchemy as sa
 from typing_extensions import TypedDict
@@ -29,6 +28,7 @@ from app.registry.decodes import NewObservation
 from app.registry.health import HealthRow, NewUnregistered
 from app.registry.spatial import distance_m
 from app.services.health.maintenance import ItemUpload, Suspicion, open_items
+from app.values import JsonObject
 
 # === Evidence of an observation on its marker's health: to the stored detail, and back to a pass.
 
@@ -64,7 +64,7 @@ class FrameHealth:
 
     of_readings: tuple[dict[str, object], ...] = ()  # evidence of each reading; empty where there is none
     # evidence of markers that are in view at a readable size, whether they were read or not
-    in_view: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    in_view: Mapping[str, JsonObject] = field(default_factory=dict)
     unregistered: tuple[NewUnregistered, ...] = ()
 
 

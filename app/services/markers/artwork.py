@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Annotated, Any
+from typing import IO, Annotated
 
 import orjson
 from pydantic import Field
@@ -39,6 +39,7 @@ from app.services.markers.tasks import draw_plate, write_sheets
 from app.services.plans.proofs import WAIT_S, results_in_order
 from app.services.ports import Clock, DecoderProcesses, JobQueue
 from app.services.progress import JobDocument, JobFiles, job_document
+from app.values import JsonObject
 
 MAX_PLATES = 5_000
 Resolution = Annotated[float, Field(ge=20, le=300, allow_inf_nan=False)]
@@ -176,7 +177,7 @@ def qr_code_header(public_url: str) -> str:
     return "public-page" if public_url else f'none; reason="{NO_QR_CODE}"'
 
 
-def _lowest_confidence(manifest: dict[str, Any]) -> float:
+def _lowest_confidence(manifest: JsonObject) -> float:
     return float(min(plate["proof"]["confidence"] for plate in manifest["plates"]))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 from itertools import islice
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import orjson
 import shapely
@@ -33,6 +33,7 @@ from app.registry.spatial import Box
 from app.registry.tiles import COARSE_ZOOM, GROUPED_ZOOM, MAX_SINGLE, FeatureGrid, Tile, feature_tile, read_grid
 from app.services.access.access import Caller
 from app.services.ports import Clock
+from app.values import JsonObject
 
 # === The coordinate reference systems that features can be asked for in, with the axes in the authority's order.
 
@@ -361,9 +362,7 @@ class Features:
                 return _count_lines(connection, agency_id, collection.lines, filtered)
         return self._ask(collection.table, lambda c: store.count_features(c, agency_id, filtered))
 
-    def get(
-        self, caller: Caller, collection: Collection, feature_id: str, crs: FeatureCrs = STORAGE_CRS
-    ) -> dict[str, Any]:
+    def get(self, caller: Caller, collection: Collection, feature_id: str, crs: FeatureCrs = STORAGE_CRS) -> JsonObject:
         """One feature.
 
         Raises
@@ -458,7 +457,7 @@ def _crosses(line: Line, box: Box) -> bool:
     )
 
 
-def _line(line: Line, crs: FeatureCrs) -> dict[str, Any]:
+def _line(line: Line, crs: FeatureCrs) -> JsonObject:
     return {
         "type": "Feature",
         "id": line.id,
@@ -476,7 +475,7 @@ def _joined(features: list[str]) -> orjson.Fragment:
     return orjson.Fragment(f"[{','.join(features)}]")
 
 
-def _in_crs(feature: dict[str, Any], crs: FeatureCrs) -> dict[str, Any]:
+def _in_crs(feature: JsonObject, crs: FeatureCrs) -> JsonObject:
     lon_deg, lat_deg, *height_m = feature["geometry"]["coordinates"]
     feature["geometry"]["coordinates"] = (*crs.from_lon_lat(lon_deg, lat_deg), *height_m)
     return feature

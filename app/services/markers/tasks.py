@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 from app.encoders.plate import BundleOptions
 from app.encoders.plate.bundle import plate_files, sheet_files
@@ -18,13 +17,14 @@ from app.planning.rules import CameraRules
 from app.services.decoder_tasks import decoder_task
 from app.services.markers.print_documents import NOTES, PrintGradeDocument, print_grade_document
 from app.services.plans.tasks import read_face
+from app.values import JsonObject
 
 Files = list[tuple[str, bytes]]
 _KMH = 3.6  # km/h in a metre a second
 
 
 @decoder_task("plate", "select fewer plates")
-def draw_plate(order: PlateOrder, name: str, options: BundleOptions) -> tuple[Files, dict[str, Any]]:
+def draw_plate(order: PlateOrder, name: str, options: BundleOptions) -> tuple[Files, JsonObject]:
     """Draw a plate, read it back, and write its files under this name: these, and its entry in the manifest."""
     return plate_files(order, name, options, read_face)
 

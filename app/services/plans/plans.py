@@ -56,6 +56,7 @@ from app.services.plans.documents import (
 from app.services.plans.proofs import APPROVED, CHECKED, COMMITTED, DRAFT, PROVED, files_of
 from app.services.plans.tasks import MadePlan, compare_plan, make_plan, write_file_of_plan
 from app.services.ports import Blobs, Clock, DecoderProcesses
+from app.values import JsonObject
 
 MAX_EXISTING = 200_000
 """Markers of the registry near a road that a plan is checked against; bounds the memory."""
@@ -205,7 +206,7 @@ class Plans:
         made = None if rules is None else self.place(caller, name or row.name, row.alignment_id, rules)
         now, agency_id = self._clock(), caller.agency_id
         with staged(self._blobs) as stage:
-            changes: dict[str, Any] = {"name": name or row.name}
+            changes: JsonObject = {"name": name or row.name}
             if made is not None and rules is not None:
                 changes |= _made_columns(caller, made, rules, stage.put("plans", made.document))
             with self._database.write(long=made is not None) as connection:

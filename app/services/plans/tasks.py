@@ -22,7 +22,7 @@ from app.geodesy.systems import is_ellipsoidal
 from app.markers.magnet_design import Codebook
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateReading, worst_verdict
-from app.planning.alignment import Alignment, AlignmentDeclaration, Floats, Lane, RoadEvent
+from app.planning.alignment import Alignment, AlignmentDeclaration, Lane, RoadEvent
 from app.planning.outputs.bill import plan_bill
 from app.planning.outputs.hd_lanelet2 import write_lanelet2
 from app.planning.outputs.hd_map import map_of_road
@@ -54,6 +54,7 @@ from app.services.plans.documents import (
     RoadSummary,
     WeakMarker,
 )
+from app.values import Floats
 
 if TYPE_CHECKING:  # it loads numba
     from app.planning.proof.prove import Prover

@@ -27,6 +27,7 @@ from app.services.markers.searches import area_of_text
 from app.services.ports import Clock, JobQueue
 from app.services.progress import JobDocument, JobFiles, job_document
 from app.services.request_work import check_deadline
+from app.values import JsonObject
 
 STREAMED = {"csv": "text/csv; charset=utf-8", "geojson": "application/geo+json"}
 WHOLE = {
@@ -121,7 +122,7 @@ class Exports:
 
     def _pages(
         self, caller: Caller, filtered: MarkerFilter, *, with_retired: bool = True
-    ) -> Iterator[list[dict[str, Any]]]:
+    ) -> Iterator[list[JsonObject]]:
         after: str | None = None
         while True:
             check_deadline()
@@ -139,7 +140,7 @@ class Exports:
             yield page
 
 
-def _reported(pages: Iterator[list[dict[str, Any]]], report: Callable[[int], None]) -> Iterator[list[dict[str, Any]]]:
+def _reported(pages: Iterator[list[JsonObject]], report: Callable[[int], None]) -> Iterator[list[JsonObject]]:
     count = 0
     for page in pages:
         yield page

@@ -24,11 +24,12 @@ from app.services.documents import cut_text, document_of
 from app.services.markers.plausibility import AccuracyDocument, accuracy_document
 from app.surveys.comparison import Comparison, ComparisonFigures
 from app.surveys.georeference import GeoreferencedSurvey, LocalGridDocument
+from app.values import JsonObject
 
 # === What is declared of an import: of the file, of its markers, and what is done with it.
 
 
-DECLARATION_EXAMPLE: dict[str, Any] = {
+DECLARATION_EXAMPLE: JsonObject = {
     "layout": "pnezd",
     "crs": "EPSG:25832",
     "epoch": 2025.4,

@@ -14,7 +14,6 @@ import sqlalchemy as sa
 from app.families.family import Family, Registration
 from app.families.surveys import (
     PLANNED,
-    Flags,
     MarkerRules,
     RowCodes,
     Rows,
@@ -24,7 +23,7 @@ from app.families.surveys import (
     unknown_texts,
 )
 from app.formats.surveys.declaration import ImportDeclaration
-from app.formats.surveys.table import Fault, Floats
+from app.formats.surveys.table import Fault
 from app.markers.reading import STATUSES
 from app.registry import markers
 from app.registry.bulk_load import Columns, JsonTexts, json_objects
@@ -35,6 +34,7 @@ from app.registry.spatial import Box, distance_m
 from app.surveys.comparison import RegisteredPoints
 from app.surveys.georeference import GeoreferencedSurvey
 from app.surveys.location_checks import NEAR_M, Neighbours
+from app.values import Bools, Floats, JsonObject
 
 # === Codes of a survey's markers: assigned where they are missing, and compared with each other and the registry.
 
@@ -160,12 +160,12 @@ def places_of(rows: Sequence[MarkerRow | PlaceRow]) -> tuple[Floats, Floats, Flo
 # === Rows of a survey become columns of markers, thousands at a time.
 
 
-_EMPTY: dict[str, Any] = dict.fromkeys(
+_EMPTY: JsonObject = dict.fromkeys(
     ("scheme", "digits", "check_digits", "digits_match_position", "n", "unit_mm", "gap_mm", "thickness_mm", "spec")
 )
 
 
-def check_values(survey: GeoreferencedSurvey, wanted: Flags) -> Iterator[Fault]:
+def check_values(survey: GeoreferencedSurvey, wanted: Bools) -> Iterator[Fault]:
     """Faults of the wanted rows that no marker of any family can have: a status or a heading."""
     texts, numbers = survey.table.texts, survey.table.numbers
     yield from unknown_texts(texts.get("status"), wanted, "status", set(STATUSES), ", ".join(STATUSES))
@@ -288,7 +288,7 @@ def _originals(survey: GeoreferencedSurvey, rows: Rows, declaration: ImportDecla
     )
 
 
-def _known(**values: Any) -> dict[str, Any]:
+def _known(**values: Any) -> JsonObject:
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -11,11 +11,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from app.simulation.magnetic.road import Road, turned_to_world
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 
 @dataclass(frozen=True, slots=True)

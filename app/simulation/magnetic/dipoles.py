@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from app.compiled import kernel
 from app.errors import InvalidParameter
 from app.markers.magnet import FIELD_UT_M3
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 
 def dipole_field_ut(points_m: Floats, dipole_m: Floats, moment_am2: Floats) -> Floats:

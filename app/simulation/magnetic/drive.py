@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from app.markers.magnet import MOMENT_AM2, Orientation, Polarity
@@ -18,11 +17,10 @@ from app.simulation.magnetic.dipoles import Cylinder, add_static_field, cylinder
 from app.simulation.magnetic.recorder import CanBus, Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, Spread, place_magnets, tag_magnets
 from app.simulation.magnetic.spheroids import spheroid_clutter
+from app.values import Floats
 
 # === How a vehicle moves over the road: speed, path, springs, and its magnetised wheels.
 
-
-Floats = npt.NDArray[np.float64]
 
 MPH = 0.44704
 """A mile per hour. [m/s] Source: international mile of 1609.344 m."""

@@ -12,11 +12,9 @@ import numpy.typing as npt
 from app.errors import InvalidParameter
 from app.formats.traces.wire import write_stream
 from app.sensors.magnetometer_bar import MagnetTrace
+from app.values import Floats
 
 # === From the field at a chip to the numbers that it sends: METRO's MLX90393 by default.
-
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from app.markers.magnet import MOMENT_AM2, InformationTag, Orientation, Polarity
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 _STEP_M = 0.25  # [m] between points of the centre line; 4 mm of sagitta at 2 m radius
 

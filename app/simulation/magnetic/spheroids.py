@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from app.simulation.magnetic.clutter import Clutter
 from app.simulation.magnetic.road import Road
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 STEEL_SUSCEPTIBILITY = 200.0
 """Of structural steel in weak fields. Source: assumed, within the 100 to 300 of mild steel's initial permeability."""

@@ -23,11 +23,10 @@ from app.simulation.radio.link import (
     receive_transmissions,
     send_beacons,
 )
+from app.values import Floats, Ints
 
 # === A driver's course in a lane, and the positions of the vehicle's satellite receiver.
 
-
-Floats = npt.NDArray[np.float64]
 
 MPH = 0.44704  # [m/s] source: definition
 _TICK_S = 0.05  # [s] the 20 Hz of RTK receivers
@@ -264,7 +263,6 @@ def _advance(lane: TrueLane, driver: Driver, rng: np.random.Generator) -> tuple[
 # === A drive past markers.
 
 
-Ints = npt.NDArray[np.int64]
 Sign = Callable[[CerpmMessage], bytes]
 
 _SNR_LIMITS_DB = (-20.0, 12.0)  # [dB] source: range that LoRa receivers report

@@ -15,8 +15,8 @@ from app.errors import InvalidParameter
 from app.lanes.cross_sections import cut_lane, direction_rad
 from app.lanes.types import MarkerPlace
 from app.markers.cerpm import DEGREE_STEP, LaneSide, SpeedLimit
+from app.values import Floats, Ints
 
-Floats = npt.NDArray[np.float64]
 Origin = tuple[float, float, float]
 
 STEP_M = 0.25  # [m] between stations; an eighth of the smoothing of 2.2 m
@@ -211,8 +211,6 @@ def _smoothed(points_m: Floats, step_m: float) -> Floats:
 
 # === Installed markers of a lane: true and surveyed positions, and missing markers.
 
-
-Ints = npt.NDArray[np.int64]
 
 SURVEY_SD_M = 0.02  # [m] of a surveyed coordinate, each axis; source: Trimble Catalyst DA2, CERPM paper, section 2.2
 _PLACING_SD_M = 0.01  # [m] of placing a marker, each axis; assumed

@@ -13,6 +13,7 @@ from app.errors import InvalidParameter
 from app.markers.cerpm import MESSAGE_BYTES
 from app.radio.link import MIN_DISTANCE_M, NEAR_DBM, NEAR_M, LinkModel, sensitivity_dbm
 from app.radio.settings import check_between, check_modulation, symbol_time_s, time_on_air_s
+from app.values import Bools, Floats, Ints
 
 # === Mean strength of a marker by two rays, the direct one and one reflected by the road, and a vehicle's antenna
 # pattern.
@@ -20,7 +21,6 @@ from app.radio.settings import check_between, check_modulation, symbol_time_s, t
 # Both are options of `Radio`; without them strength falls with the logarithm of distance, alike in all directions.
 
 
-Floats = npt.NDArray[np.float64]
 Complexes = npt.NDArray[np.complex128]
 
 ANTENNA_M = 1.5  # [m] height of the antenna above the road; source: assumed, the roof of a car
@@ -135,9 +135,6 @@ class AntennaPattern:
 
 # === The radio between markers and a vehicle.
 
-
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 _NOISE_FIGURE_DB = 6.0  # [dB] source: assumed for the SX1276, no measurement kept
 _SOFT_DB = 0.35  # [dB] scale of the logistic step from no reception to full reception; source: assumed

@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
 from app.planning.predict.rates import MagnetModel, PathModel, PlateModel, normal_quadrature
+from app.values import Floats
 from benchmarks.planning.fit.observe import LineSeen, PathSeen, PlatePassSeen, TagPassSeen
-
-Floats = npt.NDArray[np.float64]
 
 NIGHT_EXPOSURES_S = tuple(float(f"{0.002 + 0.006 * (k + 0.5) / 4:.5f}") for k in range(4))
 """Four equally likely exposures by night. Source: `at_night` of app/simulation/conditions.py, 1/500 to 1/125 s."""

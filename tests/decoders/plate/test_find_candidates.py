@@ -50,15 +50,15 @@ from app.decoders.plate.pose import marker_centroids
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, LIMITS, decode_plates
 from app.markers.plate import PlateCode, PlateGeometry
 from app.simulation.plate_scene import PlacedFace
+from app.values import Floats
 from tests.decoders.plate.scenes import AHEAD_M, face_of, road, shoot, shoot_plate
 
 Image = npt.NDArray[np.uint8]
-Array = npt.NDArray[np.float64]
 GEOMETRY = PlateGeometry()
 SQUARE = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 
 
-def true_quad(corners_px: Array, geometry: PlateGeometry = GEOMETRY, rank: float = 3.0) -> MarkerQuad:
+def true_quad(corners_px: Floats, geometry: PlateGeometry = GEOMETRY, rank: float = 3.0) -> MarkerQuad:
     """The quadruple that perfect blobs would give."""
     image_from_plate = np.append(homography_from_points(SQUARE, corners_px), 1.0).reshape(3, 3)
     return MarkerQuad(project(image_from_plate, marker_centroids(geometry)), 7, rank, MARKER_RATIO[geometry.n])
@@ -148,7 +148,7 @@ def test_the_grid_between_the_markers_counts() -> None:
     assert odds_of(image, weak) < odds_of(frame.image, weak) - 2
 
 
-def square_blob(sign: float, x: float, y: float, side: float, peak: float) -> Array:
+def square_blob(sign: float, x: float, y: float, side: float, peak: float) -> Floats:
     """A blob as `find_blobs` describes one."""
     blob = np.zeros(COLUMNS)
     blob[[SIGN, WEIGHT, X, Y]] = sign, peak * side * side, x, y

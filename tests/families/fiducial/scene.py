@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.camera import Camera
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
 _FINE = 4

@@ -17,9 +17,10 @@ from app.main import create_app
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting
 from app.sensors.camera import Camera
 from app.settings import Settings
+from app.values import Floats
 from tests.api.decodes.conftest import post_frame
 from tests.conftest import ADMIN_KEY, LiveServer
-from tests.families.fiducial.scene import Floats, lying_axes, render_sign, square_px, upright_axes
+from tests.families.fiducial.scene import lying_axes, render_sign, square_px, upright_axes
 from tests.families.fiducial.test_fiducial_markers import post, sign
 from tests.jobs import standin
 

@@ -9,9 +9,10 @@ import pytest
 from scipy.integrate import quad
 
 from app.errors import UnreadableUpload, WaymarkError
-from app.formats.alignments.geometry import AlignmentFile, Floats, StationEquation
+from app.formats.alignments.geometry import AlignmentFile, StationEquation
 from app.formats.alignments.landxml import read_landxml
 from app.formats.alignments.read import read_alignment
+from app.values import Floats
 from tests.formats.alignments.mutations import damaged
 
 METRIC = '<Units><Metric linearUnit="meter" angularUnit="decimal degrees"/></Units>'

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from app.errors import UnreadableUpload, WaymarkError
-from app.formats.alignments.geometry import AlignmentFile, BoundaryStyle, EventKind, Floats, LaneGeometry
+from app.formats.alignments.geometry import AlignmentFile, BoundaryStyle, EventKind, LaneGeometry
 from app.formats.alignments.lanelet2 import read_lanelet2
 from app.formats.alignments.read import read_alignment
+from app.values import Floats
 from tests.formats.alignments.mutations import damaged
 
 DATA = Path(__file__).resolve().parents[2] / "data" / "lanelet2"

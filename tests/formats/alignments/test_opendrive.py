@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from scipy.special import fresnel
 
-from app.formats.alignments.geometry import AlignmentFile, BoundaryStyle, EventKind, Floats, LaneGeometry
+from app.formats.alignments.geometry import AlignmentFile, BoundaryStyle, EventKind, LaneGeometry
 from app.formats.alignments.opendrive import read_opendrive
 from app.formats.alignments.opendrive.road import parse_road
 from app.formats.alignments.read import read_alignment
 from app.formats.xml_tree import parse_xml
+from app.values import Floats
 from tests.formats.alignments.xodr import LANE, LEFT, RIGHT, document, road, section
 
 DATA = Path(__file__).resolve().parents[2] / "data" / "opendrive"

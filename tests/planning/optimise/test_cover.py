@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,8 +17,8 @@ from app.planning.optimise.cover import (
     uncovered_m,
     window_rows,
 )
+from app.values import Floats
 
-Floats = npt.NDArray[np.float64]
 NEED = float(np.log(100))
 
 

@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from app.errors import InvalidParameter
@@ -17,10 +16,10 @@ from app.planning.outputs.bill import plan_bill
 from app.planning.placement import place_plan
 from app.planning.placement.place import path_error_m
 from app.planning.rules import PlanRules
+from app.values import Floats
 from tests.planning.optimise.test_path import winding
 from tests.planning.roads import road, straight
 
-Floats = npt.NDArray[np.float64]
 COSTS = {
     "currency": "EUR",
     "items": [

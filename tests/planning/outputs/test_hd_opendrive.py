@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import scenariogeneration
 from lxml import etree
@@ -27,7 +26,6 @@ from app.planning.placement import place_plan
 from app.planning.rules import PlanRules
 from tests.planning.roads import GEOD, START_DEG, bend, lane_of_curvature, opposite, road, straight
 
-Floats = npt.NDArray[np.float64]
 # ASAM's schema is under ASAM's licence and comes with the wheel of scenariogeneration; it is not part of this project
 SCHEMA = Path(scenariogeneration.__file__).parents[1] / "schemas" / "opendrive_17_core.xsd"
 

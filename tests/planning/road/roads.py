@@ -6,15 +6,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from pyproj import Transformer
 
 from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
 from app.planning.alignment import Alignment
 from app.planning.build_alignment import build_alignment
 from app.planning.rules import RoadRules
-
-Floats = npt.NDArray[np.float64]
+from app.values import Floats
 
 RULES = RoadRules(design_speed_kmh=50.0)
 PLACE = (8.4, 49.0)

@@ -18,11 +18,11 @@ from app.formats.alignments.geometry import (
     AreaGeometry,
     EventGeometry,
     EventKind,
-    Floats,
     usable_crs,
 )
 from app.formats.alignments.opendrive.road import Grid, Road, Track, build_tracks, lane_edges, parse_road, speed_m_s
 from app.formats.xml_tree import attribute, parse_xml
+from app.values import Floats
 
 # === What lies on an OpenDRIVE road: stop lines, crossings, speed limits, ends at junctions, bridges.
 

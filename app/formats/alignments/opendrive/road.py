@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import UnreadableUpload
-from app.formats.alignments.curves import GAP_ERROR_M, GAP_WARNING_M, Curve, Frame, Ints, Piece, build_curve, sample
-from app.formats.alignments.geometry import BoundaryStyle, Floats, LaneGeometry
+from app.formats.alignments.curves import GAP_ERROR_M, GAP_WARNING_M, Curve, Frame, Piece, build_curve, sample
+from app.formats.alignments.geometry import BoundaryStyle, LaneGeometry
 from app.formats.xml_tree import attribute
+from app.values import Floats, Ints
 
 LANE_TYPES = frozenset({"driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp"})
 """Lanes that vehicles drive on. Source: ASAM OpenDRIVE 1.7, e_laneType."""
