@@ -110,17 +110,17 @@ def test_the_report_states_everything_that_was_not_declared(send: Send) -> None:
     text = f"# Büro Müller\nAuftrag 7\nPunkt;Rechtswert;Hochwert;Code\n{rows}\n".encode("cp1252")
     report = send(text, dry_run=True)
     assert report["good_rows"] == 8
-    assert {one["what"]: one["value"] for one in report["detected"]} == {
+    assert {one.what: one.value for one in report["detected"]} == {
         "format": "csv", "encoding": "cp1252", "delimiter": ";", "first row": "line 4", "comments": "1 lines left out",
         "column of point": "Punkt", "column of easting": "Rechtswert", "column of northing": "Hochwert",
         "decimal sign": ",", "columns without a role": "Code",
     }  # fmt: skip
-    assert all(one["evidence"] for one in report["detected"])
+    assert all(one.evidence for one in report["detected"])
     assert report["counts"]["role_without_evidence"] == 1
     columns = {"point": "Punkt", "easting": "Rechtswert", "northing": "Hochwert", "code": None}
     declared = {"format": "csv", "encoding": "windows-1252", "delimiter": ";", "decimal": ",", "columns": columns}
     report = send(text, dry_run=True, **declared)
-    assert {one["what"] for one in report["detected"]} == {"first row", "comments", "columns without a role"}
+    assert {one.what for one in report["detected"]} == {"first row", "comments", "columns without a role"}
     assert "role_without_evidence" not in report["counts"]
     assert send(text, dry_run=True, columns={"code": "", "status": None})["good_rows"] == 8
 

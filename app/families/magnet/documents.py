@@ -10,7 +10,7 @@ from typing_extensions import TypedDict
 from app.encoders.magnet import DrillingSheet
 from app.encoders.magnet.sheets import sheet_document
 from app.families.documents import MarkerDocument, marker_head, marker_place
-from app.families.magnet.layouts import LinePlace, MagnetSpec, StoredMeaning, TagPlace, meaning_of
+from app.families.magnet.layouts import LinePlace, MagnetSpec, StoredMeaning, TagPlace, meaning_of, site_of
 from app.markers.magnet import LineStyle, LineTag, parse_tag
 from app.markers.magnet_design import Meaning
 from app.markers.reading import Check
@@ -148,7 +148,7 @@ def magnet_detail(row: MarkerRow, sheet: DrillingSheet) -> MagnetDetailDocument:
             "height_m": spec["lane"]["height_m"],
             "given": spec["lane"]["given"],
         },
-        "site": cast(Site, spec["site"]),
+        "site": site_of(spec),
         "magnets": [_hole_document(hole) for hole in written["features"]],
         "passed": sheet.passed,
         "checks": sheet.checks,

@@ -287,13 +287,22 @@ def layout_of(name: str, spec: MagnetSpec) -> MagnetLayout:
     return _layout(name, orjson.dumps({member: spec[member] for member in _LAID_OUT}))
 
 
+_FORMER_NAMES: Final = {"design_speed_mps": "design_speed_m_s", "deceleration_mps2": "deceleration_m_s2"}
+"""Of a site's members in markers that earlier releases wrote: the hashes of their versions cover the names."""
+
+
+def site_of(spec: MagnetSpec) -> Site:
+    """The site of a stored layout."""
+    stored = {_FORMER_NAMES.get(name, name): value for name, value in spec["site"].items()}
+    return Site(**{**stored, "vehicles": tuple(stored["vehicles"])})
+
+
 def sheet_of(name: str, spec: MagnetSpec) -> DrillingSheet:
     """Drilling sheet of a magnet marker by its id and its spec."""
     neighbours = [
         Neighbour(n["name"], n["lon_deg"], n["lat_deg"], Orientation(n["phi_deg"])) for n in spec["neighbours"]
     ]
-    site = Site(**{**spec["site"], "vehicles": tuple(spec["site"]["vehicles"])})
-    return drilling_sheet(layout_of(name, spec), site, neighbours)
+    return drilling_sheet(layout_of(name, spec), site_of(spec), neighbours)
 
 
 @lru_cache(maxsize=32)

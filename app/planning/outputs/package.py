@@ -89,7 +89,9 @@ MEDIA_TYPES = {
 """Media types of the files by the ends of their names."""
 
 
-def write_plan_file(plan: Plan, name: str, options: OutputOptions, draw_trade_off: DrawTradeOff | None = None) -> bytes:
+def write_plan_file(
+    plan: Plan, name: str, options: OutputOptions | None = None, draw_trade_off: DrawTradeOff | None = None
+) -> bytes:
     """One file of a plan.
 
     Raises
