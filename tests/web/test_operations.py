@@ -344,7 +344,7 @@ def test_the_settings_in_use_are_for_admins(
 
 def test_the_pages_are_used_on_a_phone(new_page: OpenPage, ids: dict[str, str]) -> None:
     watched = new_page(size=PHONE, locale="de-DE")
-    page = watched.open(f"/operations/maintenance/{ids['accepted_report']}")
+    page = watched.open(f"/operations/maintenance/{ids['approved_report']}")
     page.locator(".panel .problem").wait_for()  # this id is no item's
     watched.complaints.clear()
     page = watched.open(f"/operations/keys/{ids['key']}")

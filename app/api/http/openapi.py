@@ -82,6 +82,9 @@ def describe(app: FastAPI) -> None:
             models = component_schemas(_models_of(app))  # X-Input and X-Output of what requests and responses have
             others = {name: schema for name, schema in components["schemas"].items() if f"{name}-Input" not in models}
             schemas = others | models
+            for name in schemas:
+                if name.endswith(("-Input", "-Output")):  # generated clients take titles as names of classes
+                    schemas[name]["title"] = name.replace("-", "")
             components["schemas"] = dict(sorted(schemas.items()))  # else in the order of the first requests
             components["securitySchemes"] = SECURITY_SCHEMES
             components["responses"] = _share_problems(document)

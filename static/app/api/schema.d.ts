@@ -3774,7 +3774,7 @@ export interface components {
             id: string;
             links?: components["schemas"]["Link"][];
             properties: {
-                [key: string]: components["schemas"]["JsonValue"];
+                [key: string]: unknown;
             };
             /** @constant */
             type: "Feature";
@@ -4827,11 +4827,11 @@ export interface components {
         };
         NewFeature: {
             geometry?: {
-                [key: string]: components["schemas"]["JsonValue"];
+                [key: string]: unknown;
             } | null;
             id?: string | number | null;
             properties?: {
-                [key: string]: components["schemas"]["JsonValue"];
+                [key: string]: unknown;
             } | null;
             /** @constant */
             type?: "Feature";

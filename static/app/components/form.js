@@ -19,7 +19,7 @@ let loading = null;
 /**
  * The schema of a body, from /openapi.json, e.g. `loadSchema("PlateIn")`.
  *
- * @param {string} name
+ * @param {keyof import("../api/schema.js").components["schemas"]} name
  * @returns {Promise<Schema>}
  */
 export async function loadSchema(name) {

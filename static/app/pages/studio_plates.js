@@ -16,7 +16,7 @@ import { PrintTab } from "./studio_plates_print.js";
 
 /** @param {{ query: URLSearchParams }} props */
 export default function StudioPlates({ query }) {
-  const schemas = useLoad(async () => ({ plate: await loadSchema("PlateIn"), pass: await loadSchema("CameraPassIn") }), []);
+  const schemas = useLoad(async () => ({ plate: await loadSchema("PlateIn"), pass: await loadSchema("DraftToPass") }), []);
   const tab = query.get("tab") ?? "plate";
   const tabs = /** @type {[string, string][]} */ ([
     ["plate", t("studio.tab_plate")], ["camera", t("studio.tab_camera")], ["many", t("studio.tab_many")],

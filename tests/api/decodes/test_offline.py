@@ -129,7 +129,7 @@ def test_a_trace_gives_the_same_tags_meanings_and_fixes(real_client: httpx.Clien
         assert meaning is not None
         assert {"kind": meaning.kind, "value": meaning.value} == online["match"]["meaning"]
         fix = online["fix"]
-        assert (tag.fix.grade, list(tag.fix.notes)) == (fix["localization_grade"], fix["notes"])
+        assert (tag.fix.localization_grade, list(tag.fix.notes)) == (fix["localization_grade"], fix["notes"])
         assert tag.fix.lon_deg == pytest.approx(fix["lon_deg"], abs=2e-9)
         assert tag.fix.lat_deg == pytest.approx(fix["lat_deg"], abs=2e-9)
         assert tag.fix.heading_deg == pytest.approx(fix["heading_deg"], abs=1e-4)

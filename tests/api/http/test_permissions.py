@@ -42,7 +42,7 @@ CALIBRATED: dict[str, Any] = {
     "camera": {"width_px": 1, "height_px": 1, "fx_px": 1.0, "fy_px": 1.0, "cx_px": 0.0, "cy_px": 0.0, "distortion": []},
     "sigma": {"fx_px": 1.0, "fy_px": 1.0, "cx_px": 0.0, "cy_px": 0.0, "distortion": []},
     "coverage": {"share": 0.5, "cells": [[1]]},
-    "board": {"columns": 7, "rows": 10, "square_mm": 25.0, "marker_mm": 18.0, "dictionary": "DICT_4X4_100"},
+    "board": {"columns": 7, "rows": 10, "square_mm": 25.0, "marker_mm": 18.0, "dictionary": "DICT_5X5_100"},
 }  # fmt: skip
 TUS = {"Tus-Resumable": "1.0.0", "Upload-Offset": "0"}
 NOBODY_ID = "019cb624-0000-7000-8000-00000000ffff"

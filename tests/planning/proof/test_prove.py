@@ -60,7 +60,7 @@ def test_a_slow_camera_misses_plates_for_want_of_frames() -> None:
     )
     report = prove_plan(plan, ProofTerms(drives=3))
     assert 0 < report.rates[0].read < 6
-    assert {marker.cause for marker in report.weak} == {"few frames at this speed"}
+    assert {marker.cause for marker in report.list_weak()} == {"few frames at this speed"}
 
 
 def test_a_plate_right_behind_a_sharp_bend_is_missed_because_of_the_bend() -> None:
