@@ -13,8 +13,8 @@ from app.errors import InvalidParameter, WaymarkError
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-INPUT = ConfigDict(extra="forbid", json_schema_serialization_defaults_required=True)
-"""Of every part of a request: members that it does not know are refused. A response has all members."""
+INPUT = ConfigDict(extra="forbid")
+"""Of every part of a request: members that it does not know are refused."""
 
 
 class StrictModel(BaseModel):
@@ -110,7 +110,7 @@ def input_error(item: Mapping[str, object], path: list[str], whole: str = "body"
         f"{at}: {item['msg']}",
         field=at,
         limit=", ".join(limits) or str(item["msg"]),
-        cure=cures.get(str(item["type"]), f"correct {at}; /docs describes what it may be"),
+        cure=cures.get(str(item["type"]), f"correct {at}; /docs describes its values"),
     )
 
 

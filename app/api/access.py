@@ -9,13 +9,13 @@ from fastapi import Body, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator, ConfigDict, Field
 from typing_extensions import TypedDict
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, PageSize, Text, Whole, use_case
+from app.api.http.dependencies import Caller, Idempotency, LastId, PageSize, use_case
 from app.api.http.permissions import ADMINS, EVERYBODY, OPERATORS, PUBLIC, Allowed
 from app.api.http.problems import problem_responses
-from app.api.http.responses import Time, document_response, json_response, page_response
+from app.api.http.responses import document_response, json_response, page_response
 from app.api.http.routes import Router
 from app.api.jobs import queued_job
-from app.families.documents import StrictModel
+from app.inputs import Identifier, StrictModel, Text, Time, Whole
 from app.registry.audit import EntryFilter
 from app.services.access.access import AGENCY_SCOPES, MAX_AGENCY_NAME, Access, Scope
 from app.services.access.audit import (

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from fastapi import Path, Query, Request, Response
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, PageSize, use_case
+from app.api.http.dependencies import Caller, Idempotency, LastId, PageSize, use_case
 from app.api.http.permissions import EVERYBODY, UPLOADERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -19,6 +19,7 @@ from app.api.http.responses import (
     page_response,
 )
 from app.api.http.routes import Router
+from app.inputs import Identifier
 from app.registry.jobs import JobState
 from app.services.drives.documents import TRACK_FILES, DrivePage, TrackedDriveDocument
 from app.services.drives.drives import Drives as DrivesService

@@ -10,17 +10,7 @@ from fastapi import Depends, Path, Query, Request, Response
 from pydantic import ConfigDict
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, idempotency_of, read_declaration
-from app.api.http.dependencies import (
-    AfterVersion,
-    Caller,
-    Idempotency,
-    Identifier,
-    LastId,
-    PageSize,
-    Text,
-    Version,
-    use_case,
-)
+from app.api.http.dependencies import AfterVersion, Caller, Idempotency, LastId, PageSize, Version, use_case
 from app.api.http.permissions import ADMINS, EVERYBODY, PLANNERS, READERS, SURVEYORS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -37,8 +27,8 @@ from app.api.http.routes import Router
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
 from app.errors import UnreadableUpload
-from app.families.documents import StrictModel
 from app.formats.format import SpooledFile
+from app.inputs import Identifier, StrictModel, Text
 from app.markers.snapshot import MEDIA_TYPE
 from app.sensors.camera import CalibrationBoard
 from app.services.fleet.calibrations import DECLARATION_EXAMPLE, CalibrationDeclaration, Calibrations

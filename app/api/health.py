@@ -8,13 +8,13 @@ from fastapi import Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
-from app.api.http.dependencies import AfterLink, Caller, MarkerId, PageSize, SentVersion, Text, use_case
+from app.api.http.dependencies import AfterLink, Caller, MarkerId, PageSize, SentVersion, use_case
 from app.api.http.permissions import READERS, SURVEYORS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import cursor_of, document_response, file_response, json_response, page_response
 from app.api.http.routes import Router
 from app.families import FamilyName
-from app.families.documents import Identifier, StrictModel
+from app.inputs import Identifier, StrictModel, Text
 from app.registry.health import ItemFilter
 from app.services.health.maintenance import HealthDocument, ItemStatus, MaintenanceItem, MaintenancePage, Outcome, What
 from app.services.health.maintenance import Maintenance as MaintenanceService

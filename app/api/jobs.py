@@ -17,7 +17,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http import event_stream
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
+from app.api.http.dependencies import Caller, LastId, PageSize, use_case
 from app.api.http.event_stream import EventStream, LastEventId, ServerEvent, StreamPlaces
 from app.api.http.permissions import EVERYBODY, PLANNERS, READERS
 from app.api.http.problems import problem_responses
@@ -33,7 +33,7 @@ from app.api.http.responses import (
 )
 from app.api.http.routes import Router
 from app.errors import InvalidParameter, Unavailable
-from app.families.documents import StrictModel
+from app.inputs import Identifier, StrictModel, Text
 from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState
 from app.services.access.access import Caller as CallerValue
 from app.services.ports import Clock

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Path, Request, Response
 from fastapi.responses import StreamingResponse
 
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_case
+from app.api.http.dependencies import Caller, LastId, PageSize, use_case
 from app.api.http.permissions import ADMINS, EVERYBODY
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -18,6 +18,7 @@ from app.api.http.responses import (
     page_response,
 )
 from app.api.http.routes import Router
+from app.inputs import Identifier
 from app.services.reprocessing import (
     Criteria,
     DecodeVersions,

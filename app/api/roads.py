@@ -7,19 +7,7 @@ from typing import Annotated
 from fastapi import Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
-from app.api.http.dependencies import (
-    AfterLink,
-    AfterVersion,
-    Caller,
-    Idempotency,
-    Identifier,
-    LastId,
-    Number,
-    PageSize,
-    Text,
-    Version,
-    use_case,
-)
+from app.api.http.dependencies import AfterLink, AfterVersion, Caller, Idempotency, LastId, PageSize, Version, use_case
 from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -34,7 +22,8 @@ from app.api.http.responses import (
 )
 from app.api.http.routes import Router
 from app.errors import InvalidParameter
-from app.families.documents import Metres, StrictModel
+from app.families.documents import Metres
+from app.inputs import Identifier, Number, StrictModel, Text
 from app.services.markers.markers import MarkerPage
 from app.services.roads.documents import (
     ChangedRoad,

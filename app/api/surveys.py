@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, idempotency_of, read_declaration
-from app.api.http.dependencies import Caller, Idempotency, Number, Text, use_case
+from app.api.http.dependencies import Caller, Idempotency, use_case
 from app.api.http.permissions import READERS, SURVEYORS
 from app.api.http.problems import FieldError, Problem, problem_responses, report_problem
 from app.api.http.responses import (
@@ -28,7 +28,7 @@ from app.api.jobs import queued_job
 from app.api.markers.searches import Filtered, check_measures
 from app.errors import InvalidParameter, UnreadableUpload
 from app.families import FamilyName
-from app.families.documents import StrictModel
+from app.inputs import Number, StrictModel, Text
 from app.markers.reading import Status
 from app.services.idempotency import IdempotencyKey
 from app.services.markers.searches import checked_box
@@ -126,9 +126,9 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
 
     CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, KMZ, GPX, LandXML, JobXML, GSI or DXF.
 
-    With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
-    nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one that is sent with
-    `Prefer: respond-async`: 202, and the job at Location has the report as its result.
+    With `dry_run` nothing is stored, and the report lists what would be. A refused import answers 422 with its report in
+    the problem, and nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one
+    that is sent with `Prefer: respond-async`: 202, and the job at Location has the report as its result.
     """
     if asked.as_job:
         return queued_job(*jobs.submit(caller, asked.given, asked.idempotency))

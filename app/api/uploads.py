@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.decodes.uploads import context_of, with_vehicle
 from app.api.http.bodies import append, finish, media_type_of, read_declaration, spool_of
-from app.api.http.dependencies import Caller, Identifier, use_case
+from app.api.http.dependencies import Caller, use_case
 from app.api.http.permissions import UPLOADERS
 from app.api.http.problems import BodyRefused, Described, problem_responses, reference
 from app.api.http.responses import BINARY, document_response, json_response
@@ -32,6 +32,7 @@ from app.errors import (
     WrongChecksum,
 )
 from app.formats.format import SpooledFile
+from app.inputs import Identifier
 from app.services.decodes.declarations import UploadContext
 from app.services.uploads.quotas import UploadDocument
 from app.services.uploads.uploads import Grant, Uploads

@@ -36,5 +36,5 @@ def union_of(shapes: Iterable[Any]) -> Any:
 
 
 def union_of_documents(documents: Iterable[Any]) -> Any:
-    """The union of the documents of families; the member `family` tells them apart."""
+    """The union of the documents of families; the member `family` distinguishes them."""
     return Annotated[union_of(documents), Discriminator("family")]

@@ -13,12 +13,7 @@ from app.families.surveys import ColumnValues
 from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
 from app.geodesy.systems import VerticalDatum as VerticalDatum
-from app.inputs import Flag as Flag
-from app.inputs import Identifier as Identifier
-from app.inputs import Number as Number
-from app.inputs import StrictModel as StrictModel
-from app.inputs import Text as Text
-from app.inputs import Whole as Whole
+from app.inputs import Number, StrictModel, Text
 from app.markers.reading import Status
 from app.registry.conditions import grade_columns
 from app.registry.marker_rows import MarkerRow

@@ -20,10 +20,7 @@ from app.families.documents import (
     Headed,
     MarkerDocument,
     MarkerIn,
-    Number,
     PositionIn,
-    StrictModel,
-    Text,
     marker_head,
     marker_place,
     place_input,
@@ -55,6 +52,7 @@ from app.families.surveys import (
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import PlacedPosition
+from app.inputs import Number, StrictModel, Text
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting, get_dictionary
 from app.markers.reading import PlatePose
 from app.planning.outputs.hd_map import MapMarker

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from enum import StrEnum
-from typing import NotRequired, TypeVar, cast
+from typing import TYPE_CHECKING, NotRequired, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,11 @@ from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, WaymarkError
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 DocumentT = TypeVar("DocumentT")
+InstanceT = TypeVar("InstanceT", bound="DataclassInstance")
 
 
 def document_of(document: type[DocumentT], source: object, **others: object) -> DocumentT:
@@ -33,16 +37,16 @@ def document_of(document: type[DocumentT], source: object, **others: object) -> 
     return cast(DocumentT, {name: others[name] if name in others else getattr(source, name) for name in names})
 
 
-def rounded(source: DocumentT, places: Mapping[str, int]) -> DocumentT:
+def rounded(source: InstanceT, places: Mapping[str, int]) -> InstanceT:
     """A dataclass with its numbers rounded to so many places, by the names of their fields: long lists take less."""
     values: dict[str, object] = {}
-    for name in source.__dataclass_fields__.keys() & places.keys():  # type: ignore[attr-defined]
+    for name in source.__dataclass_fields__.keys() & places.keys():
         value = getattr(source, name)
         if isinstance(value, tuple):
             values[name] = tuple(round(one, places[name]) for one in value)
         elif value is not None:
             values[name] = round(value, places[name])
-    return replace(source, **values)  # type: ignore[type-var]
+    return replace(source, **values)
 
 
 def listed(values: npt.ArrayLike, places: int) -> list[float | None]:

@@ -1,10 +1,12 @@
-"""Planned magnets as rows of the registry."""
+"""Magnets as rows of the registry: planned ones, and sites that earlier releases stored."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import UTC, datetime
+from typing import cast
 
-from app.families.magnet.layouts import MAX_MAGNETS
+from app.families.magnet.layouts import MAX_MAGNETS, MagnetSpec, site_of
 from app.families.magnet.magnets import MAGNET
 from app.families.surveys import Commitment, MarkerRules
 from app.planning.placement import place_plan
@@ -20,3 +22,13 @@ def test_a_long_line_becomes_several_markers_of_no_more_magnets_than_one_may_hav
     assert len(made.markers) > MAX_MAGNETS
     assert [row.covered for row in rows] == [MAX_MAGNETS, len(made.markers) - MAX_MAGNETS]
     assert rows[1].columns["original"]["plan"]["number"] == made.markers[MAX_MAGNETS].number
+
+
+def test_a_site_of_an_earlier_release_is_read() -> None:
+    site = {
+        "design_speed_mps": 20.0, "stop_line_chainage_m": 130.0, "vehicles": ["van"], "readable_clearance_m": 0.3,
+        "reaction_s": 2.0, "deceleration_mps2": 3.0,
+    }  # fmt: skip
+    older = site_of(cast(MagnetSpec, {"site": site}))
+    assert (older.design_speed_m_s, older.deceleration_m_s2, older.vehicles) == (20.0, 3.0, ("van",))
+    assert site_of(cast(MagnetSpec, {"site": asdict(older)})) == older

@@ -88,11 +88,14 @@ class Recording:
             )
         )  # fmt: skip
 
-    def along(self, every_s: float, start_s: float = 3.0, end_s: float = math.inf, **more: object) -> Recording:
+    def along(
+        self, every_s: float, start_s: float = 3.0, end_s: float = math.inf, *, clock: str = "camera",
+        late_s: float = 0.0, sigma_m: float = 0.08, marker: str | None = None,
+    ) -> Recording:  # fmt: skip
         """Fixes at even times."""
         last = min(end_s, float(self.truth.time_s[-1] - self.truth.time_s[0]) - 1.0)
         for at in np.arange(start_s, last, every_s):
-            self.see(float(at), **{"decode_id": "upload", **more})  # type: ignore[arg-type]
+            self.see(float(at), clock=clock, late_s=late_s, sigma_m=sigma_m, marker=marker, decode_id="upload")
         return self
 
     def track_input(

@@ -8,14 +8,13 @@ from fastapi import Path, Query, Request, Response
 
 from app.api.decodes.uploads import RAW_TYPES, Upload
 from app.api.http.bodies import form_body
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
+from app.api.http.dependencies import Caller, LastId, PageSize, use_case
 from app.api.http.permissions import EVERYBODY, UPLOADERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
     NOT_MODIFIED,
     IfNoneMatch,
-    Time,
     created_response,
     document_response,
     file_response,
@@ -23,6 +22,7 @@ from app.api.http.responses import (
     page_response,
 )
 from app.api.http.routes import Router
+from app.inputs import Identifier, Text, Time
 from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind

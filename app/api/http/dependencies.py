@@ -11,10 +11,7 @@ from fastapi.dependencies.models import Dependant
 
 from app.api.http.responses import IdempotencyKeyHeader, IfMatch
 from app.errors import InvalidParameter, NotAuthenticated, VersionRequired
-from app.inputs import Identifier as Identifier
-from app.inputs import Number as Number
-from app.inputs import Text as Text
-from app.inputs import Whole as Whole
+from app.inputs import Identifier, Text
 from app.services.access.access import Caller as CallerValue
 from app.services.idempotency import IdempotencyKey
 from app.services.markers.markers import Markers as MarkersService

@@ -7,7 +7,6 @@ a test compares it with the app's own document, which does not depend on setting
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -88,7 +87,6 @@ def describe(app: FastAPI) -> None:
             components["schemas"] = dict(sorted(schemas.items()))  # else in the order of the first requests
             components["securitySchemes"] = SECURITY_SCHEMES
             components["responses"] = _share_problems(document)
-            _require_defaults(document)
             _require_keys(document)
             _describe_headers(document)
             app.openapi_schema = document
@@ -134,31 +132,6 @@ def _share_problems(document: JsonObject) -> JsonObject:
             shared[name] = response
             responses[status] = {"$ref": f"{_RESPONSES}{name}"}
     return dict(sorted(shared.items()))
-
-
-def _require_defaults(document: JsonObject) -> None:
-    """A member with a default is always part of a response; clients may leave it out of requests only."""
-    schemas = document["components"]["schemas"]
-    operations = (operation for path in document["paths"].values() for operation in path.values())
-    names = [name for operation in operations for name in _names_in(operation.get("requestBody"))]
-    sent: set[str] = set()
-    while names:
-        if (name := names.pop()) not in sent:
-            sent.add(name)
-            names += _names_in(schemas.get(name))
-    for name in schemas.keys() - sent:
-        properties = schemas[name].get("properties", {})
-        required = schemas[name].get("required", [])
-        always = [member for member, schema in properties.items() if member in required or "default" in schema]
-        if always:
-            schemas[name]["required"] = always
-        for schema in properties.values():
-            schema.pop("default", None)
-
-
-def _names_in(part: object) -> list[str]:
-    """Names of the schemas that a part of the document refers to."""
-    return re.findall(r'"#/components/schemas/([^"]+)"', json.dumps(part))
 
 
 def _require_keys(document: JsonObject) -> None:

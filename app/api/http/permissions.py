@@ -1,7 +1,7 @@
 """Who may call what: scopes, which routes name at their functions, and the key in a request.
 
-The middleware asks before a body is read. A path without a route is refused. docs/access.md says what each
-scope is for.
+The middleware asks before a body is read. A path without a route is refused. docs/access.md describes the
+scopes.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ import structlog
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import ConfigDict, TypeAdapter, with_config
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core.core_schema import DataclassField, ModelField, TypedDictField, WithDefaultSchema
 from starlette.exceptions import HTTPException
 from starlette.types import Scope
 
@@ -45,11 +47,23 @@ def with_reference(response: JsonObject) -> JsonObject:
     return {**described, "content": {**described.get("content", {}), "application/json": {"schema": schema}}}
 
 
+class _Schemas(GenerateJsonSchema):
+    """Schemas in which a response has all members: those with a default may be left out of requests only."""
+
+    def field_is_required(self, field: ModelField | DataclassField | TypedDictField, total: bool) -> bool:
+        if self.mode == "serialization" and field["type"] != "typed-dict-field":
+            return True
+        return super().field_is_required(field, total)
+
+    def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
+        return self.generate_inner(schema["schema"]) if self.mode == "serialization" else super().default_schema(schema)
+
+
 def component_schemas(others: Iterable[tuple[Any, Mode]] = ()) -> JsonObject:
     """The schemas of all models that are referred to, of others, and of the models within them, by name."""
     models = (*_MODELS.values(), *others)
     adapters = [(number, mode, TypeAdapter(model)) for number, (model, mode) in enumerate(models)]
-    _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE)
+    _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE, schema_generator=_Schemas)
     found: JsonObject = schemas["$defs"]
     return found
 

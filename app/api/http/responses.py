@@ -14,7 +14,6 @@ from fastapi import Header, Request, Response
 
 from app.api.http.problems import Described, problem_responses
 from app.errors import InvalidParameter
-from app.inputs import Time as Time
 from app.values import JsonObject
 
 BINARY: dict[str, str] = {"type": "string", "format": "binary"}

@@ -14,8 +14,8 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from app.api.http.dependencies import Number
 from app.formats.json_text import parse_json
+from app.inputs import Number
 from app.services.request_work import counted
 from app.values import JsonObject
 

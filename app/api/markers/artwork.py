@@ -29,7 +29,7 @@ from app.api.markers.searches import SelectionIn
 from app.encoders.cerpm import hex_dump
 from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkFormat, ArtworkOptions
-from app.families.documents import Flag
+from app.inputs import Flag
 from app.markers.cerpm import MAX_SEQUENCE
 from app.services.markers.artwork import ArtworkJobs, Artworks, ArtworkTerms, Bundle, Resolution
 from app.services.markers.programs import CerpmPrograms, Layouts, PayloadDocument, payload_document

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Path, Query, Request, Response
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Text, use_case
+from app.api.http.dependencies import Caller, Idempotency, LastId, use_case
 from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -21,9 +21,9 @@ from app.api.http.responses import (
 from app.api.http.routes import Router
 from app.encoders.magnet import CodebookRules
 from app.errors import InvalidParameter
-from app.inputs import StrictModel
+from app.inputs import Identifier, StrictModel, Text
 from app.markers.magnet import MIN_GAP_M
-from app.markers.magnet_design import Meaning, TagDesign
+from app.markers.magnet_design import Meaning, MeaningKind, TagDesign
 from app.services.markers.codebooks import (
     CodebookDocument,
     CodebookDraftDocument,
@@ -180,7 +180,7 @@ def list_entries(
     codebook_id: CodebookId,
     caller: Caller,
     codebooks: Service,
-    kind: Annotated[Text | None, Query(max_length=40, examples=["bend-right"])] = None,
+    kind: MeaningKind | None = None,
     value: Annotated[Text | None, Query(max_length=80, examples=["125"])] = None,
 ) -> Response:
     """List the entries of a codebook.
@@ -201,7 +201,7 @@ def get_entry(
     return json_response(codebooks.entry(caller, codebook_id, code))
 
 
-def _meaning(kind: str | None, value: str | None) -> Meaning | None:
+def _meaning(kind: MeaningKind | None, value: str | None) -> Meaning | None:
     if kind is None and value is None:
         return None
     if kind is None or value is None:
@@ -215,7 +215,7 @@ def _meaning(kind: str | None, value: str | None) -> Meaning | None:
         number: float | str = float(value) if kind not in ("arrow", "notice") else value
     except ValueError:
         number = value
-    return Meaning(kind, number)  # type: ignore[arg-type]  # it knows the kinds
+    return Meaning(kind, number)
 
 
 # === /v1/codebook-drafts: the capacity of a codebook before it is made. Nothing is stored.

@@ -20,18 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from app.api.http.dependencies import (
-    AfterVersion,
-    Caller,
-    Idempotency,
-    Identifier,
-    MarkerId,
-    Markers,
-    PageSize,
-    Text,
-    Version,
-    use_case,
-)
+from app.api.http.dependencies import AfterVersion, Caller, Idempotency, MarkerId, Markers, PageSize, Version, use_case
 from app.api.http.permissions import PLANNERS, READERS, SURVEYORS
 from app.api.http.problems import (
     UNION_TAG,
@@ -46,7 +35,6 @@ from app.api.http.problems import (
 from app.api.http.responses import (
     NOT_MODIFIED,
     IfNoneMatch,
-    Time,
     created_response,
     document_response,
     json_response,
@@ -57,8 +45,9 @@ from app.api.http.routes import Router
 from app.api.http.strict_json import validated
 from app.errors import InvalidParameter, WaymarkError
 from app.families import FAMILIES, FAMILY_NAMES, union_of
-from app.families.documents import POSITION_EXAMPLE, Headed, MarkerIn, PositionIn, StrictModel
+from app.families.documents import POSITION_EXAMPLE, Headed, MarkerIn, PositionIn
 from app.families.plate.plates import PLATE_EXAMPLES
+from app.inputs import Identifier, StrictModel, Text, Time
 from app.markers.reading import Status
 from app.services.documents import cut_text
 from app.services.markers.bulk import BulkInput, BulkReport, Item, ItemProblem, MarkerUpdate

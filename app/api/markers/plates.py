@@ -11,7 +11,7 @@ from fastapi import Depends, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, read_declaration
-from app.api.http.dependencies import Caller, Identifier, Number, Text, use_case
+from app.api.http.dependencies import Caller, use_case
 from app.api.http.permissions import READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, document_response, file_response, json_response
@@ -20,7 +20,7 @@ from app.encoders.plate import ArtworkFormat
 from app.errors import InvalidParameter, UnreadableUpload, naming
 from app.families.plate.plates import SCHEME_DESCRIPTION, GeometryIn
 from app.formats.format import SpooledFile
-from app.inputs import StrictModel
+from app.inputs import Identifier, Number, StrictModel, Text
 from app.markers.plate import RECOMMENDED_SCHEME, PlateCode, PlateScheme, recommended_geometry
 from app.planning.predict.rates import CameraPass
 from app.planning.rules import CameraRules

@@ -9,15 +9,16 @@ from typing import Annotated
 from fastapi import Depends, Query, Request, Response
 from pydantic import ConfigDict, Field, model_validator
 
-from app.api.http.dependencies import AfterLink, Caller, Identifier, LastId, Number, PageSize, Text, use_case
+from app.api.http.dependencies import AfterLink, Caller, LastId, PageSize, use_case
 from app.api.http.permissions import READERS
 from app.api.http.responses import checked_id, cursor_of, document_response, json_response, page_response, parse_time
 from app.api.http.routes import Router
 from app.api.http.strict_json import AnyPolygon
 from app.errors import InvalidParameter
 from app.families import FamilyName
-from app.families.documents import Metres, StrictModel
+from app.families.documents import Metres
 from app.geodesy import check_lon_lat
+from app.inputs import Identifier, Number, StrictModel, Text
 from app.markers.reading import Status
 from app.registry.markers import MarkerFilter
 from app.services.markers.markers import FoundMarker, MarkerPage

@@ -20,7 +20,7 @@ from app.api.http.bodies import (
     read_text,
     received_form,
 )
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
+from app.api.http.dependencies import Caller, LastId, PageSize, use_case
 from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses, reference
 from app.api.http.responses import (
@@ -40,7 +40,7 @@ from app.api.markers.searches import Filtered
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.formats.alignments.read import RoadLanes
 from app.formats.format import SpooledFile
-from app.inputs import StrictModel
+from app.inputs import Identifier, StrictModel, Text
 from app.planning.alignment import AlignmentDeclaration
 from app.services.idempotency import IdempotencyKey
 from app.services.plans.alignments import Alignments

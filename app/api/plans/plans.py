@@ -11,17 +11,7 @@ from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field, JsonValue, with_config
 
-from app.api.http.dependencies import (
-    AfterVersion,
-    Caller,
-    Idempotency,
-    Identifier,
-    LastId,
-    PageSize,
-    Text,
-    Version,
-    use_case,
-)
+from app.api.http.dependencies import AfterVersion, Caller, Idempotency, LastId, PageSize, Version, use_case
 from app.api.http.permissions import PLANNERS, READERS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -40,7 +30,7 @@ from app.api.http.routes import Router
 from app.api.jobs import queued_job
 from app.api.plans.alignments import Name
 from app.formats.surveys.declaration import Unit
-from app.inputs import Flag, StrictModel
+from app.inputs import Flag, Identifier, StrictModel, Text
 from app.planning.outputs.package import MEDIA_TYPES, PackageOptions
 from app.planning.proof import ProofReport, ProofTerms
 from app.planning.radio_checks import RadioCheck, RadioPlan, check_radio

@@ -8,7 +8,7 @@ from fastapi import Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
 from app.api.health import RejectionIn
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, Version, use_case
+from app.api.http.dependencies import Caller, LastId, PageSize, Version, use_case
 from app.api.http.permissions import ADMINS, READERS, SURVEYORS
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -21,7 +21,7 @@ from app.api.http.responses import (
     versioned_response,
 )
 from app.api.http.routes import Router
-from app.families.documents import Flag, StrictModel
+from app.inputs import Flag, Identifier, StrictModel, Text
 from app.services.public_pages.pages import (
     DamageReport,
     DamageReportPage,

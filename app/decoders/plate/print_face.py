@@ -29,7 +29,7 @@ CLIPPED_LEVEL = 251
 """[grey level] from which a pixel counts as over-exposed. JPEG moves 255 by a few levels."""
 _LUMA = np.array([0.0722, 0.7152, 0.2126], np.float32)
 """Luminance of linear blue, green, red. Source: IEC 61966-2-1 with ITU-R BT.709."""
-_DARK_WEIGHT = 0.2  # of dark units in the light, to which stray light adds
+_DARK_WEIGHT = 0.2  # of dark units in the estimate of the light: stray light makes them brighter
 _HUBER = 0.05  # [natural log] residual from which a unit counts less in the light
 _LIGHT_STEPS = 12  # of reweighted least squares; it settles after six
 _MAX_LIGHTS_FOR_LINEAR = 9  # light units up to which the light is linear

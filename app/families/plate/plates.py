@@ -25,11 +25,7 @@ from app.families.documents import (
     Headed,
     MarkerDocument,
     MarkerIn,
-    Number,
     PositionIn,
-    StrictModel,
-    Text,
-    Whole,
     marker_head,
     marker_place,
     place_input,
@@ -53,6 +49,7 @@ from app.families.surveys import (
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import UNFIT_TEXT, PlacedPosition
+from app.inputs import Number, StrictModel, Text, Whole
 from app.markers.plate import (
     RECOMMENDED_SCHEME,
     PlateCode,

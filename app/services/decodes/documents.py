@@ -52,7 +52,7 @@ class DecodeHead(_Decode):
 
 
 class FramesDecode(_Decode, FramesResult):
-    """A decode of frames. `decoder` and what follows it are there once it is done, or as far as it is: `partial`."""
+    """A decode of frames; while it is decoded, `partial` is true and the result covers the frames so far."""
 
     kind: Literal[DecodeKind.FRAME, DecodeKind.ARCHIVE, DecodeKind.VIDEO]
     partial: NotRequired[Annotated[bool, Field(description="The decode goes on; this is its result so far.")]]
@@ -73,7 +73,7 @@ class PacketsDecode(_Decode, PacketsResult):
 DecodeDocument = TypeAliasType(
     "DecodeDocument", Annotated[FramesDecode | TraceDecode | PacketsDecode, Discriminator("kind")]
 )
-"""A decode with its result; `kind` tells which."""
+"""A decode with its result, which has one of three shapes by its `kind`."""
 
 
 class DecodePage(TypedDict):

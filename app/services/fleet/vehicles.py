@@ -66,8 +66,6 @@ PROFILE_EXAMPLE: dict[str, JsonValue] = {
     },
 }  # fmt: skip
 
-Object = JsonObject
-
 
 class VehicleCamera(CameraDeclaration):
     """A vehicle's camera: that of a context; intrinsics may come later, from a calibration."""
@@ -97,12 +95,12 @@ class VehicleProfile(Profile):
         with naming("profile"):
             Profile.check(usable)
 
-    def document(self) -> Object:
+    def document(self) -> JsonObject:
         """The profile as it is stored: the members that have a value."""
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
 
-def inherit(profile: Object, stated: Object, kind: str) -> tuple[Object, dict[str, str]]:
+def inherit(profile: JsonObject, stated: JsonObject, kind: str) -> tuple[JsonObject, dict[str, str]]:
     """Complete what an upload states from the vehicle's profile.
 
     Parameters
@@ -147,7 +145,7 @@ def _has_projection(camera: Mapping[str, object]) -> bool:
     return any(camera.get(name) is not None for name in (*INTRINSICS, "horizontal_fov_deg"))
 
 
-def _fitting_camera(camera: Object, stated: Mapping[str, object]) -> Object:
+def _fitting_camera(camera: JsonObject, stated: Mapping[str, object]) -> JsonObject:
     """A profile's camera without its calibration's id and the members that the upload's camera invalidates."""
     known = {name for name, value in stated.items() if value is not None}
     dropped = {"calibration_id"}
@@ -168,8 +166,8 @@ def _fitting_camera(camera: Object, stated: Mapping[str, object]) -> Object:
     return camera
 
 
-def _merge(ours: Object, stated: Object, sources: dict[str, str], path: str = "") -> Object:
-    merged: Object = {}
+def _merge(ours: JsonObject, stated: JsonObject, sources: dict[str, str], path: str = "") -> JsonObject:
+    merged: JsonObject = {}
     for name in {**ours, **stated}:
         at, is_stated = f"{path}{name}", name in stated
         own, value = ours.get(name), stated[name] if is_stated else ours[name]
@@ -443,7 +441,7 @@ def _holder(connection: sa.Connection, caller: Caller, key_id: str) -> str:
     return holder_id
 
 
-def _check_calibrated(connection: sa.Connection, caller: Caller, profile: Object) -> None:
+def _check_calibrated(connection: sa.Connection, caller: Caller, profile: JsonObject) -> None:
     """A camera that names its calibration has the calibration's figures."""
     camera = profile.get("camera") or {}
     calibration_id = camera.get("calibration_id")

@@ -2708,7 +2708,7 @@ export interface components {
             height_px: number;
             width_px: number;
         };
-        CalibrationBoard: {
+        "CalibrationBoard-Input": {
             /** @default 7 */
             columns?: number;
             /**
@@ -2723,6 +2723,14 @@ export interface components {
             /** @default 25 */
             square_mm?: number;
         };
+        "CalibrationBoard-Output": {
+            columns: number;
+            /** @constant */
+            dictionary: "DICT_5X5_100";
+            marker_mm: number;
+            rows: number;
+            square_mm: number;
+        };
         CalibrationChoice: {
             calibration_id: string;
         };
@@ -2736,12 +2744,12 @@ export interface components {
              *       "dictionary": "DICT_5X5_100"
              *     }
              */
-            board?: components["schemas"]["CalibrationBoard"];
+            board?: components["schemas"]["CalibrationBoard-Input"];
             /** @default null */
             coefficients?: (4 | 5 | 8) | null;
         };
         CalibrationDocument: {
-            board: components["schemas"]["CalibrationBoard"];
+            board: components["schemas"]["CalibrationBoard-Output"];
             camera: components["schemas"]["CalibratedCamera"];
             coverage: components["schemas"]["Coverage"];
             /** Format: date-time */
@@ -6756,24 +6764,24 @@ export interface components {
             step_s: number;
         };
         TraceReport: {
-            clock_offsets_s?: {
+            clock_offsets_s: {
                 [key: string]: number;
             };
             decode_ms: number;
             driven_m: number;
             duration_s: number;
-            formats?: {
+            formats: {
                 [key: string]: components["schemas"]["TraceFormat"];
             };
             gap_count: number;
-            gaps?: components["schemas"]["TraceGap"][];
+            gaps: components["schemas"]["TraceGap"][];
             heading_coverage: number;
-            left_out?: components["schemas"]["LeftOutRows"][];
+            left_out: components["schemas"]["LeftOutRows"][];
             load_ms: number;
             rate_hz: number;
             samples: number;
             speed_coverage: number;
-            warnings?: string[];
+            warnings: string[];
         };
         TraceSummary: {
             crossings: number;
@@ -8461,7 +8469,7 @@ export interface operations {
     list_entries: {
         parameters: {
             query?: {
-                kind?: string | null;
+                kind?: components["schemas"]["MeaningKind"] | null;
                 value?: string | null;
             };
             header?: never;

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -96,7 +96,7 @@ def test_options_that_do_not_fit_are_refused(package: Package) -> None:
     for options in (
         PackageOptions(scale=300),
         PackageOptions(crs="EPSG:1"),
-        PackageOptions(unit="ell"),  # type: ignore[arg-type]
+        PackageOptions(unit=cast(Any, "ell")),
     ):
         with pytest.raises(InvalidParameter):
             Package(package.plan, options).check()
