@@ -126,9 +126,9 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
 
     CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, KMZ, GPX, LandXML, JobXML, GSI or DXF.
 
-    With `dry_run` nothing is stored, and the report lists what would be. A refused import answers 422 with its report in
-    the problem, and nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one
-    that is sent with `Prefer: respond-async`: 202, and the job at Location has the report as its result.
+    With `dry_run` nothing is stored, and the report lists what would be. A refused import answers 422 with the report
+    in the problem, and nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does
+    one that is sent with `Prefer: respond-async`: 202, and the job at Location has the report as its result.
     """
     if asked.as_job:
         return queued_job(*jobs.submit(caller, asked.given, asked.idempotency))
