@@ -103,15 +103,19 @@ def input_error(item: Mapping[str, object], path: list[str], whole: str = "body"
     cause = context.get("error")
     if isinstance(cause, WaymarkError):
         field = _joined(path, cause.field) or at
-        return InvalidParameter(cause.message, field=field, limit=cause.limit, cure=cause.cure)
+        return InvalidParameter(cause.message, field=field, limit=cause.limit, cure=cause.cure or _cure(field))
     near = f"did you mean {context['near']}? If not, " if "near" in context else ""
     cures = {"missing": f"send {at}", "extra_forbidden": f"{near}leave {at} out"}
     return InvalidParameter(
         f"{at}: {item['msg']}",
         field=at,
         limit=", ".join(limits) or str(item["msg"]),
-        cure=cures.get(str(item["type"]), f"correct {at}; /docs describes its values"),
+        cure=cures.get(str(item["type"]), _cure(at)),
     )
+
+
+def _cure(field: str) -> str:
+    return f"correct {field}; /docs describes its values"
 
 
 def _joined(path: list[str], field: str | None) -> str:

@@ -40,6 +40,7 @@ def test_a_refusal_names_field_limit_and_cure(document: dict[str, Any], field: s
         parse_input(DecodeContext, document)
     assert refused.value.field == field
     assert limit in (refused.value.limit or "")
+    assert refused.value.cure
 
 
 def test_all_faults_are_named() -> None:

@@ -385,7 +385,10 @@ class Reprocessings:
             ids = [row.id for row in found if _is_meant(row.context, row.decoder, criteria, box)]
         if not 1 <= len(ids) <= MAX_DECODES:
             raise InvalidParameter(
-                f"{len(ids)} uploads meet the criteria", limit=f"1 to {MAX_DECODES}", cure="change the criteria"
+                f"{len(ids)} uploads meet the criteria",
+                field="body",
+                limit=f"1 to {MAX_DECODES}",
+                cure="change the criteria",
             )
         stored = criteria.model_dump(mode="json", exclude_none=True)
         row = ReprocessingRow(new_id(now), agency_id, caller.label, stored, len(ids), now)
