@@ -11,7 +11,7 @@ import math
 import os
 import uuid
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -67,7 +67,7 @@ class SnapshotMarker:
     heading_rmse_deg: float | None
     ellipsoidal: bool  # the height is above the ellipsoid
     exact: bool  # fit for localization by its survey and its reference frame
-    kind: Mapping[str, Any]  # what it has in common with others: scheme and geometry, or side and speed limit
+    kind: JsonObject  # what it has in common with others: scheme and geometry, or side and speed limit
     distance_m: float  # [m] from the place it was looked for
     # [deg] longitude and latitude of where the lane of an information tag begins
     lane_start_deg: tuple[float, float] | None = None

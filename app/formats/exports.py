@@ -6,7 +6,7 @@ import io
 import re
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -20,8 +20,9 @@ from pyproj import Transformer
 
 from app.formats.text import TableWriter
 from app.geodesy.systems import is_ellipsoidal
+from app.values import JsonObject
 
-Record = Mapping[str, Any]
+Record = JsonObject
 
 TEXTS = (
     "id", "family", "status", "scheme", "code", "side", "road", "realization", "vertical_datum", "survey_method",

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from app.lanes.observations import (
 )
 from app.lanes.smooth_line import SmoothLine, lengths_along
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, LaneRules, LeftOutReason, Notes
-from app.values import Bools, Floats, Ints
+from app.values import Bools, Floats, Ints, JsonObject
 
 # === Which boundary of the lane each marker stands on: the most likely course of the lane beside an initial line.
 
@@ -212,7 +211,7 @@ _MIN_SLOPE_SHARE = 0.05  # of a pair's variance that others explain; keeps the d
 _SCATTERS = (1.6, 2.5, 4.0)  # of markers, in their stated accuracy; 3.5, 5.5, 9 cm for the usual 2.2
 _MIN_GAIN = 1.5  # of the log likelihood by a larger scatter; on scenes of `benchmarks.hunt cerpm`
 _STIFFER = 3  # bends that are tried with a scatter: the one found and stiffer ones
-_CONSTANT_WIDTH: Mapping[str, Any] = WIDTH_MODELS[0]
+_CONSTANT_WIDTH: JsonObject = WIDTH_MODELS[0]
 _OPPOSITE_SHARE = 0.2  # of sides that agree with the track, below which they are of the other direction
 _MIN_SIDED_MARKERS = 4  # to compare sides with the track
 _SIDE_OFFSETS_M = (0.5, 4.0)  # [m] nearest and farthest offset at which a side is clear

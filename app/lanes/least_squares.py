@@ -15,10 +15,8 @@ Without a track the third field sums up the length of the centre on stretches of
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy
@@ -26,7 +24,7 @@ import scipy
 from app.compiled import ieee_kernel
 from app.lanes.observations import NO_KNOWN_LENGTHS, KnownLengths
 from app.lanes.smooth_line import SmoothLine, left_normals
-from app.values import Floats, Ints
+from app.values import Floats, Ints, JsonObject
 
 # === Least squares with unknowns along a line: the matrices are banded, so the cost is linear in the line's length.
 #
@@ -456,7 +454,7 @@ def choose_hyperparameters(
 
 
 def _most_likely(
-    problem: LaneProblem, bases: list[Hyperparameters], changes: tuple[Mapping[str, Any], ...]
+    problem: LaneProblem, bases: list[Hyperparameters], changes: tuple[JsonObject, ...]
 ) -> Hyperparameters:
     candidates = [replace(base, **change) for base, change in zip(bases, changes, strict=True)]
     return max(candidates, key=problem.log_likelihood)

@@ -6,12 +6,12 @@ Source: METRO paper, section 4.2, equation 2 and figures 5 and 17a.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import product
 from math import comb
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,7 @@ from app.markers.magnet import (
     segments_in,
     ticks_from_m,
 )
-from app.values import Floats
+from app.values import Floats, JsonObject
 
 
 @with_config(INPUT)
@@ -597,7 +597,7 @@ class Codebook:
         }
 
     @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> Codebook:
+    def from_document(cls, document: JsonObject) -> Codebook:
         """The book that `to_document` wrote.
 
         Raises

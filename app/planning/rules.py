@@ -14,7 +14,7 @@ from datetime import date
 from functools import cache, lru_cache
 from importlib import resources
 from itertools import islice
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
@@ -585,7 +585,7 @@ def _limit(path: list[str | int]) -> str | None:
     return ", or ".join(dict.fromkeys(limits)) or None
 
 
-def _allowed(schema: Mapping[str, Any]) -> str | None:
+def _allowed(schema: JsonObject) -> str | None:
     """Allowed values of a schema, for people."""
     if "const" in schema:
         return str(schema["const"])

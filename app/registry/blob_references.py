@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import Any
 
 import sqlalchemy as sa
 
+from app.registry.column_types import AnySelect
 from app.registry.decodes import decodes
 from app.registry.jobs import JobKind, jobs
 from app.registry.plan_states import plans
@@ -47,6 +47,6 @@ def blob_references(connection: sa.Connection) -> Iterator[str]:
             yield from _KEY.findall(text)
 
 
-def _stream(connection: sa.Connection, query: sa.Select[Any]) -> Iterator[str]:
+def _stream(connection: sa.Connection, query: AnySelect) -> Iterator[str]:
     with connection.execute(query.execution_options(yield_per=_ROWS)) as rows:
         yield from rows.scalars()

@@ -105,17 +105,19 @@ def new_id(now: datetime) -> str:
 # costs as much as SQLAlchemy's own row.
 
 
+AnySelect = sa.Select[*tuple[Any, ...]]
+AnyColumn = sa.ColumnElement[Any]
 RowT = TypeVar("RowT", bound=tuple[object, ...])
 _CHUNK = 500
 _TIMES = ("created_at", "updated_at")
 
 
-def columns_of(row: type[RowT], table: sa.FromClause) -> list[sa.ColumnElement[Any]]:
+def columns_of(row: type[RowT], table: sa.FromClause) -> list[AnyColumn]:
     """The columns of a table that a NamedTuple has, in the order of its fields."""
     return [table.c[name] for name in row.__dict__["_fields"]]
 
 
-def select_rows(row: type[RowT], table: sa.FromClause) -> sa.Select[Any]:
+def select_rows(row: type[RowT], table: sa.FromClause) -> AnySelect:
     """A query for the columns of a table that a NamedTuple has; `fetch_all` and `find_one` run it."""
     return sa.select(*columns_of(row, table))
 
@@ -132,14 +134,14 @@ def row_of(row: type[RowT], values: Any) -> RowT:
 
 
 def fetch_all(
-    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], values: Mapping[str, object] | None = None
+    connection: sa.Connection, query: AnySelect, row: type[RowT], values: Mapping[str, object] | None = None
 ) -> list[RowT]:
     """All rows that a query returns."""
     return list(map(row_maker(row), connection.execute(query, values)))
 
 
 def fetch_in(
-    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], column: sa.Column[Any], values: Iterable[object]
+    connection: sa.Connection, query: AnySelect, row: type[RowT], column: sa.Column[Any], values: Iterable[object]
 ) -> Iterator[RowT]:
     """The rows of a query that have one of many values in a column, some values at a time."""
     wanted = list(values)
@@ -148,7 +150,7 @@ def fetch_in(
 
 
 def find_one(
-    connection: sa.Connection, query: sa.Select[Any], row: type[RowT], values: Mapping[str, object] | None = None
+    connection: sa.Connection, query: AnySelect, row: type[RowT], values: Mapping[str, object] | None = None
 ) -> RowT | None:
     """The only row that a query returns; None if there is none."""
     found = connection.execute(query, values).one_or_none()

@@ -20,6 +20,7 @@ from sqlalchemy.sql.functions import FunctionElement
 
 from app.geodesy import LocalizationGrade, grade_accuracy, total_accuracy_m
 from app.geodesy.place import stored_frame
+from app.registry.column_types import AnyColumn
 from app.values import JsonObject
 
 # === Columns of a marker's grade, also for rows and versions from before there were grades.
@@ -116,7 +117,7 @@ class Joined:
 Condition = Compared | Missing | Constant | Not | Joined
 
 
-def condition_sql(condition: Condition, columns: dict[str, sa.ColumnElement[Any]]) -> sa.ColumnElement[bool]:
+def condition_sql(condition: Condition, columns: dict[str, AnyColumn]) -> sa.ColumnElement[bool]:
     """The condition as SQL on columns, by their properties' names."""
     match condition:
         case Constant(value):

@@ -18,6 +18,7 @@ import sqlalchemy as sa
 
 from app.geodesy.systems import ELLIPSOID, is_ellipsoidal
 from app.registry.bulk_load import Columns, JsonTexts, json_objects, json_texts
+from app.registry.column_types import AnyColumn, AnySelect
 from app.registry.conditions import Condition, condition_sql
 from app.registry.marker_rows import MarkerRow, markers
 from app.registry.plan_states import find_plan_states
@@ -31,7 +32,7 @@ class Field(NamedTuple):
 
     name: str
     kind: str
-    column: sa.ColumnElement[Any]
+    column: AnyColumn
     text: str
 
 
@@ -84,7 +85,7 @@ class FeatureTable:
     table: sa.Table  # with the columns row, id, agency_id, lon_deg, lat_deg and height_m, and a spatial index
     fields: tuple[Field, ...]
     owned: sa.ColumnElement[bool]  # which rows of the table they are
-    text: sa.ColumnElement[Any]  # the feature as GeoJSON, in one line
+    text: AnyColumn  # the feature as GeoJSON, in one line
     changed: sa.ColumnElement[object]  # time of the last change
     tiled: tuple[str, ...]  # fields that points in tiles have
     cheap_to_count: frozenset[str]  # fields by which rows are counted in little time
@@ -269,10 +270,10 @@ def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
 
 
 @lru_cache(maxsize=1024)
-def _page(shape: _Shape, counted: bool) -> sa.Select[Any]:
+def _page(shape: _Shape, counted: bool) -> AnySelect:
     """One row: a line for each feature. A driver that fetches a hundred rows gives way to other threads at each."""
     most = sa.bindparam("most", type_=sa.Integer)
-    matched: sa.ColumnElement[Any] = sa.null()
+    matched: AnyColumn = sa.null()
     if counted:  # in the same statement, so that it is the same snapshot
         matched = _count(shape._replace(after=False)).correlate(None).scalar_subquery()
     table = shape.table
@@ -282,20 +283,20 @@ def _page(shape: _Shape, counted: bool) -> sa.Select[Any]:
 
 
 @lru_cache(maxsize=1024)
-def _count(shape: _Shape) -> sa.Select[Any]:
+def _count(shape: _Shape) -> AnySelect:
     return sa.select(sa.func.count()).select_from(shape.table.source).where(*_conditions(shape))
 
 
 @lru_cache
-def _one(table: FeatureTable) -> sa.Select[Any]:
+def _one(table: FeatureTable) -> AnySelect:
     query = sa.select(table.text).select_from(table.source)
     return query.where(*table.conditions, table.table.c.id == sa.bindparam("id"))
 
 
 @lru_cache
-def _extent(table: FeatureTable) -> sa.Select[Any]:
+def _extent(table: FeatureTable) -> AnySelect:
     c, epoch = table.table.c, sa.null() if table.epoch is None else table.epoch
-    figures: Mapping[str, sa.ColumnElement[Any]] = {
+    figures: Mapping[str, AnyColumn] = {
         "total": sa.func.count(),
         "west": sa.func.min(c.lon_deg),
         "south": sa.func.min(c.lat_deg),

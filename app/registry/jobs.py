@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime, timedelta
 from enum import StrEnum
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import sqlalchemy as sa
 
@@ -14,6 +14,7 @@ from app.errors import NotFound
 from app.registry import column_types
 from app.registry.column_types import (
     ID,
+    AnyColumn,
     UtcTime,
     agency_column,
     fetch_all,
@@ -184,7 +185,7 @@ def list_progress(connection: sa.Connection, job_ids: Sequence[str]) -> list[Job
     return list(fetch_in(connection, query, JobRow, jobs.c.id, job_ids))
 
 
-def _without(*names: str) -> list[sa.ColumnElement[Any]]:
+def _without(*names: str) -> list[AnyColumn]:
     return [sa.null().label(name) if name in names else jobs.c[name] for name in JobRow._fields]
 
 

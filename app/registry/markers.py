@@ -19,6 +19,7 @@ from app.registry.audit import AuditEntry, add_versions
 from app.registry.bulk_load import Columns, json_objects, large_load, load_columns
 from app.registry.column_types import (
     ID,
+    AnySelect,
     UtcTime,
     agency_column,
     fetch_all,
@@ -375,7 +376,7 @@ def list_near(
 
 
 @lru_cache
-def _near(parts: int, families: tuple[str, ...]) -> sa.Select[Any]:
+def _near(parts: int, families: tuple[str, ...]) -> AnySelect:
     """Statement of `list_near`, built once: every frame runs it, and building it costs more."""
     number = partial(sa.bindparam, type_=sa.Double)
     proposed = (

@@ -12,12 +12,11 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
-from app.registry.column_types import row_maker
+from app.registry.column_types import AnySelect, row_maker
 from app.registry.features import in_box
 from app.registry.marker_rows import PUBLIC, MarkerRow, markers
 from app.registry.markers import MarkerFilter, conditions_of
@@ -197,7 +196,7 @@ class _Search:
         near = distances <= radius_m
         return rows[near], distances[near]
 
-    def _measured(self, statement: sa.Select[Any], values: JsonObject) -> tuple[Ints, Floats]:
+    def _measured(self, statement: AnySelect, values: JsonObject) -> tuple[Ints, Floats]:
         found = self._connection.execute(statement, {**values, "agency": self._agency_id}).all()
         places = np.array([tuple(row) for row in found], dtype=np.float64).reshape(-1, 3)
         return places[:, 0].astype(np.int64), distances_m(self._lon, self._lat, places[:, 1], places[:, 2])
@@ -219,13 +218,13 @@ def _sides(parts: tuple[Box, ...]) -> dict[str, float]:
 
 
 @lru_cache(maxsize=256)
-def _inside(filtered: MarkerFilter, wide: tuple[bool, ...], whole: bool) -> sa.Select[Any]:
+def _inside(filtered: MarkerFilter, wide: tuple[bool, ...], whole: bool) -> AnySelect:
     """Markers in the boxes of `_sides`."""
     return _owned(filtered, whole).where(sa.or_(*(in_box(k, is_wide) for k, is_wide in enumerate(wide))))
 
 
 @lru_cache(maxsize=256)
-def _in_order(filtered: MarkerFilter, whole: bool) -> sa.Select[Any]:
+def _in_order(filtered: MarkerFilter, whole: bool) -> AnySelect:
     """Markers in the order of their distance in degrees (PostGIS)."""
     geom = sa.table("markers", sa.column("geom")).c.geom
     point = sa.func.ST_MakePoint(sa.bindparam("lon", type_=sa.Double), sa.bindparam("lat", type_=sa.Double))
@@ -233,11 +232,11 @@ def _in_order(filtered: MarkerFilter, whole: bool) -> sa.Select[Any]:
 
 
 @lru_cache(maxsize=256)
-def _anywhere(filtered: MarkerFilter) -> sa.Select[Any]:
+def _anywhere(filtered: MarkerFilter) -> AnySelect:
     return _owned(filtered, False)
 
 
-def _owned(filtered: MarkerFilter, whole: bool) -> sa.Select[Any]:
+def _owned(filtered: MarkerFilter, whole: bool) -> AnySelect:
     columns = (_C.row, *PUBLIC) if whole else _PLACES
     most = sa.bindparam("most", type_=sa.Integer)
     return sa.select(*columns).where(_C.agency_id == sa.bindparam("agency"), *conditions_of(filtered)).limit(most)

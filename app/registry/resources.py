@@ -10,7 +10,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import sqlalchemy as sa
 
 from app.errors import Conflict, NotFound, StaleVersion
-from app.registry.column_types import fetch_all, find_one, new_id, select_rows
+from app.registry.column_types import AnySelect, fetch_all, find_one, new_id, select_rows
 
 RowT = TypeVar("RowT", bound=tuple[object, ...])
 
@@ -195,13 +195,13 @@ class Resource(Generic[RowT]):
         assert self.versions is not None, f"no history is kept of a {self.name}"
         return self.versions
 
-    def _select(self, agency_id: str, equal: Mapping[str, object]) -> sa.Select[Any]:
+    def _select(self, agency_id: str, equal: Mapping[str, object]) -> AnySelect:
         c = self.table.c
         return select_rows(self.row, self.table).where(
             c.agency_id == agency_id, *(c[name] == value for name, value in equal.items())
         )
 
-    def _versions(self, agency_id: str, resource_id: str) -> sa.Select[Any]:
+    def _versions(self, agency_id: str, resource_id: str) -> AnySelect:
         c = self._kept.c
         query = sa.select(c.version, c.at, c.who, c.why, c[self.name])
         return query.where(c[f"{self.name}_id"] == resource_id, c.agency_id == agency_id)

@@ -8,13 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from types import NoneType
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import orjson
 import sqlalchemy as sa
 
+from app.registry.column_types import AnyColumn, AnySelect
 from app.registry.features import FeatureTable, in_box
 from app.registry.spatial import Box
 from app.values import Ints
@@ -222,7 +222,7 @@ def feature_tile(
     return write_layer(layer, dict(zip(("id", *table.tiled), columns, strict=True)), places)
 
 
-def _selected(table: FeatureTable, wide: bool, *columns: sa.ColumnElement[Any]) -> sa.Select[Any]:
+def _selected(table: FeatureTable, wide: bool, *columns: AnyColumn) -> AnySelect:
     most = sa.bindparam("most", type_=sa.Integer)
     rows = sa.select(*columns, table.table.c.id, *(table.columns[name].label(name) for name in table.tiled))
     rows = rows.select_from(table.source).where(*table.conditions, in_box(0, wide, table.table))
@@ -230,14 +230,14 @@ def _selected(table: FeatureTable, wide: bool, *columns: sa.ColumnElement[Any]) 
 
 
 @lru_cache
-def _columns(table: FeatureTable, wide: bool) -> sa.Select[Any]:
+def _columns(table: FeatureTable, wide: bool) -> AnySelect:
     """One row of JSON arrays, their numbers with 15 digits: a row for each marker would take longer than the search."""
     q = _selected(table, wide, table.table.c.lon_deg, table.table.c.lat_deg).subquery()
     return sa.select(*map(sa.func.json_group_array, q.c))
 
 
 @lru_cache
-def _tile(table: FeatureTable, wide: bool) -> sa.Select[Any]:
+def _tile(table: FeatureTable, wide: bool) -> AnySelect:
     """A tile by PostGIS, with the projection of `Tile.from_lon_lat`: ST_Transform takes longer than the whole query."""
     number = partial(sa.bindparam, type_=sa.Double)
     c = table.table.c
@@ -332,7 +332,7 @@ def read_grid(
 
 
 @lru_cache
-def _counts(table: FeatureTable, on_tile: bool) -> sa.Select[Any]:
+def _counts(table: FeatureTable, on_tile: bool) -> AnySelect:
     """Number and mean position of the features of each cell, family and status.
 
     Whether a database cuts a number or rounds it to a whole one moves all cells alike.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import sqlalchemy as sa
 
@@ -12,6 +12,7 @@ from app.errors import NotFound
 from app.registry.column_types import (
     COUNTED_ID,
     ID,
+    AnySelect,
     UtcTime,
     agency_column,
     fetch_all,
@@ -294,7 +295,7 @@ def postpone_giving_up(connection: sa.Connection, webhook_id: str, give_up_at: d
     connection.execute(waiting.values(give_up_at=give_up_at, due_at=due_at))
 
 
-def _due(now: datetime, per_webhook: int, limit: int) -> sa.Select[Any]:
+def _due(now: datetime, per_webhook: int, limit: int) -> AnySelect:
     """Ids of deliveries to send now, oldest first: a few of each webhook, so that none that is slow delays others."""
     place = sa.func.row_number().over(partition_by=_D.webhook_id, order_by=(_D.due_at, _D.id)).label("place")
     ranked = (

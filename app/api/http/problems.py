@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from http import HTTPStatus
 from typing import Any, Literal, NamedTuple, NotRequired
 
@@ -331,7 +331,7 @@ def _http_detail(request: Request, error: HTTPException) -> str:
     return str(error.detail)
 
 
-def validation_fault(item: Mapping[str, Any]) -> FieldError:
+def validation_fault(item: JsonObject) -> FieldError:
     """The invalid input that an error of pydantic names."""
     location = [str(part) for part in item["loc"] if not str(part).startswith(UNION_TAG)]
     error = input_error(item, location[1:], location[0])

@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import jwt
 import structlog
 
 from app.errors import NotAllowed, NotAuthenticated, Unavailable
 from app.services.access.access import AGENCY_SCOPES, Bearer, Scope
+from app.values import JsonObject
 
 _LOG = structlog.get_logger(__name__)
 MAX_TOKEN_CHARACTERS = 8192
@@ -197,7 +197,7 @@ def _label(claims: Mapping[str, object], subject: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in label)[:200]
 
 
-def _ends_at(claims: Mapping[str, Any]) -> datetime:
+def _ends_at(claims: JsonObject) -> datetime:
     return datetime.fromtimestamp(min(float(claims["exp"]), 4e9), UTC)
 
 

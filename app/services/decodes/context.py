@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Literal
 
 from app.formats.format import ArchiveLimits
 from app.formats.images import ImageLimits
@@ -14,6 +13,7 @@ from app.formats.packets.rows import PacketLimits
 from app.formats.traces.declaration import TraceLimits
 from app.formats.video_file import VideoLimits
 from app.registry.decodes import DecodeRow
+from app.values import JsonObject
 
 # === Kinds of decodes.
 
@@ -75,7 +75,7 @@ class DecodeTimes:
         """Time of a sample. [s]"""
         return round(t_s + self.zero_s, 4)
 
-    def frame_s(self, frame: Mapping[str, Any]) -> float | None:
+    def frame_s(self, frame: JsonObject) -> float | None:
         """Time of a frame, None if it is not known. [s]"""
         if self.clock == "utc":
             return _seconds(frame.get("captured_at")) or (self.captured_s if self.alone else None)

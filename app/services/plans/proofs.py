@@ -12,7 +12,7 @@ from contextlib import closing
 from contextvars import copy_context
 from datetime import timedelta
 from functools import partial
-from typing import Any, TypeVar, TypeVarTuple, cast
+from typing import TypeVar, TypeVarTuple, cast
 
 import sqlalchemy as sa
 
@@ -33,6 +33,7 @@ from app.services.plans.documents import ProofResult
 from app.services.plans.tasks import WrittenProof, check_proof, list_proof_units, prove_unit, write_proof
 from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue, Pending
 from app.services.progress import JobDocument, job_document
+from app.values import JsonObject
 
 # === Many tasks of one job in the decoder processes, a limited number of them at the same time.
 
@@ -311,7 +312,7 @@ class Proofs:
         delete_unused(self._blobs, files_of(row.proof))
 
 
-def files_of(proof: Mapping[str, Any] | None) -> list[str]:
+def files_of(proof: JsonObject | None) -> list[str]:
     """Keys of the blobs of a plan's proof."""
     return list(proof["keys"].values()) if proof is not None else []
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 from itertools import chain
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from app.registry.roads import ROADS, RoadRow, RoadSummaryRow, StoredStation
 from app.roads.axis import Axis, Foot
 from app.roads.lane_line import CalibrationPoint, Measures, calibrate
 from app.services.documents import document_of
+from app.values import JsonObject
 
 # === The lines and the calibration of a road as they are sent, brought to WGS 84 and onto the axis.
 
@@ -384,7 +385,7 @@ def _disagreement(route: Route, foot: Foot, measure_m: float, old: Route | None)
 def linear_references(
     connection: sa.Connection,
     agency_id: str,
-    markers: Sequence[Mapping[str, Any]],
+    markers: Sequence[JsonObject],
     before_m: Sequence[float | None],
 ) -> list[dict[str, float | None]]:
     """Measure and offset of markers whose columns name a road with an axis, None where they have no place on it.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Protocol
 
 from app.errors import InvalidParameter
 from app.families.surveys import RETIRED
@@ -180,9 +180,7 @@ class ExportJobs:
         self._database, self._clock, self._queue = database, clock, queue
         self._exports, self._files, self._ttl = exports, files, idempotency_ttl
 
-    def submit(
-        self, caller: Caller, wanted: Mapping[str, Any], key: IdempotencyKey | None = None
-    ) -> tuple[JobDocument, bool]:
+    def submit(self, caller: Caller, wanted: JsonObject, key: IdempotencyKey | None = None) -> tuple[JobDocument, bool]:
         """Queue an export; returns whether it was queued before.
 
         Parameters
@@ -223,7 +221,7 @@ class ExportJobs:
             self._files.finish(job, path, name=name, media_type=media_type, headers=headers)
 
 
-def filter_of(wanted: Mapping[str, Any]) -> MarkerFilter:
+def filter_of(wanted: JsonObject) -> MarkerFilter:
     """The filter of an export.
 
     Parameters
