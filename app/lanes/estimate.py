@@ -9,6 +9,7 @@ import numpy as np
 
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
+from app.lanes.driven_lane import choose_driven_lane, describe_tie
 from app.lanes.initial_line import (
     TRUSTED_TRACK_M,
     DrivenLine,
@@ -33,6 +34,10 @@ _TRACK_APART = (
 )
 _BEYOND_TRACK_M = 15.0  # [m] further past its ends a track is not used; sensitivity 1.00, 1.00
 _PRECISE_TRACK_M = 0.1  # [m] noise of a track that shows sides by itself; between RTK and other receivers
+_NO_LINE = "the markers share no line"
+_MIN_ROW = 4  # markers in each row of a double line
+_ROWS_M = 0.08  # [m] between the rows of a double line, at least; four times the survey's 0.02 m
+_ROW_GAP_SHARE = 0.3  # of the distance of two rows that is empty between them
 _MAX_BESIDE_TRACK_M = 4.0  # [m] such sides are of markers at most a lane's width away
 
 
@@ -77,6 +82,8 @@ def fit_lane(
     if method == "paper":
         return _fit_by_splines(observations, taken, line, notes)
     lane = _fit_by_least_squares(observations, taken, line, drive, rules, notes)
+    if (lane.refusal or "").startswith(_NO_LINE) and drive is not None and track is not None:
+        lane = _fit_driven_lane(observations, taken, drive, _mean_speed_m_s(track), rules, lane)
     if track is None:
         return lane
     agreement = compare_with_track(lane, track)
@@ -145,6 +152,65 @@ def _connected_markers(observations: LaneObservations, taken: Bools, rules: Lane
     return belongs
 
 
+# --- the driven lane among several --------------------------------------------------------------------------------
+
+
+def _fit_driven_lane(
+    observations: LaneObservations, taken: Bools, drive: DrivenLine, speed_m_s: float, rules: LaneRules, refused: Lane
+) -> Lane:
+    """Fit the lane that is driven, among the markers of several; the refused lane where there is none."""
+    half = rules.usual_width_m / 2
+    station, left = drive.line.project_markers(observations.point_m, observations.side, half)
+    chosen = choose_driven_lane(station[taken], left[taken], observations.side[taken], drive, speed_m_s)
+    if chosen is None:
+        return refused
+    notes = Notes()
+    if chosen.others:
+        return refused_path(observations, notes, describe_tie(chosen, drive.accuracy_m), "waymark")
+    side = np.zeros(len(taken), np.int64)
+    side[taken] = chosen.side
+    own = side != UNKNOWN
+    for _ in range(2):
+        lane = _fit_by_least_squares(replace(observations, side=side), own, drive.line, drive, rules, notes)
+        inner = own & ~_outer_rows(lane, observations, side)
+        if lane.refusal is not None or (inner == own).all():
+            break
+        own, notes = inner, Notes()
+    for k in np.flatnonzero(taken & ~own):
+        notes.left_out.append(
+            LeftOut(int(observations.row[k]), int(observations.number[k]), LeftOutReason.OTHER_LANE, float("nan"))
+        )
+    return replace(lane, left_out=tuple(notes.left_out))
+
+
+def _outer_rows(lane: Lane, observations: LaneObservations, side: Ints) -> Bools:
+    """Markers of the outer row where a boundary is a line of two rows: it belongs to the lane beside."""
+    first_row = np.full(len(side), -1)
+    for row, at in enumerate(observations.of_row.tolist()):
+        if at >= 0:
+            first_row[at] = row
+    residual = lane.residual_m[first_row]
+    outer = np.zeros(len(side), bool)
+    for which, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
+        rows = np.flatnonzero((side == which) & np.isfinite(residual))
+        if len(rows) < 2 * _MIN_ROW:
+            continue
+        off = sign * residual[rows]
+        ranked = np.sort(off)
+        gap = np.diff(ranked)[_MIN_ROW - 1 : len(off) - _MIN_ROW]
+        at = int(np.argmax(gap))
+        split = (ranked[at + _MIN_ROW - 1] + ranked[at + _MIN_ROW]) / 2
+        low, high = off[off < split], off[off >= split]
+        if gap[at] > _ROW_GAP_SHARE * (np.median(high) - np.median(low)) and np.median(high) - np.median(low) > _ROWS_M:
+            outer[rows[off >= split]] = True
+    return outer
+
+
+def _mean_speed_m_s(track: PoseTrack) -> float:
+    """Of a track while it moves. [m/s]"""
+    return track.driven_m() / max(float(np.ptp(track.time_s)), 1.0)
+
+
 # --- methods ------------------------------------------------------------------------------------------------------
 
 
@@ -176,7 +242,7 @@ def _fit_by_least_squares(
     for k, (reason, off) in fit.left_out.items():
         notes.left_out.append(LeftOut(int(observations.row[k]), int(observations.number[k]), reason, off))
     if not found:
-        return refused(f"the markers share no line: {len(fit.left_out)} of them lie off it")
+        return refused(f"{_NO_LINE}: {len(fit.left_out)} of them lie off it")
     if _is_row_of_unknown_side(fit, observations, taken, drive):
         return refused("one row of markers, and nothing shows on which side of the lane it is")
     _warn_of_guessed_sides(fit, observations, drive, notes)

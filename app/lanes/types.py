@@ -124,6 +124,8 @@ class LeftOutReason(StrEnum):
     """Its position is on one boundary, its message names the other."""
     APART = "apart"
     """It is too far from the rest to belong to the same stretch of lane."""
+    OTHER_LANE = "other_lane"
+    """It is on no boundary of the lane that is driven: another lane's marker."""
 
 
 @dataclass(frozen=True, slots=True)
