@@ -1,4 +1,4 @@
-"""Which of the lanes that were heard is driven: pairs of lines beside the vehicle's track.
+"""The driven lane among several marked lanes.
 
 A vehicle hears the markers of all lanes within radio range. Along its track the centre and the width of a lane are
 followed by dynamic programming. At a station a lane costs little where there are markers on both of its boundaries,
@@ -39,6 +39,7 @@ _ANOTHER_M = 1.3  # [m] centres further apart are of two lanes; half of the narr
 _TIE = 14.0  # squared sigmas; odds of 1 to 1,100
 _ONCOMING_COST = 30.0  # squared sigmas for a lane whose both boundaries send the other side
 _ONCOMING_SHARE = 0.7  # of the markers on each boundary that send the other side
+_FORBIDDEN = 1e6  # cost of a state that a course may not have; above every course
 _ON_BOUNDARY_M = 0.9  # [m] of a marker from a boundary of its lane
 
 
@@ -52,17 +53,15 @@ class LaneCourse(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivenLane:
-    """The lane that is driven, as far as it can be told."""
+    """The driven lane, and lanes that are equally likely."""
 
     side: Ints  # shape (K,): boundary that each marker is on; UNKNOWN for those of other lanes
-    others: tuple[LaneCourse, ...]  # lanes that are as likely; none where the driven one is clear
     course: LaneCourse
+    others: tuple[LaneCourse, ...]  # equally likely lanes; none where the driven one is certain
 
 
-def choose_driven_lane(
-    station_m: Floats, left_m: Floats, named: Ints, drive: DrivenLine, speed_m_s: float
-) -> DrivenLane | None:
-    """Find the lane that is driven among all markers beside a track; None where no lane contains the track.
+def choose_driven_lane(station_m: Floats, left_m: Floats, named: Ints, drive: DrivenLine) -> DrivenLane | None:
+    """Find the driven lane among all markers beside a track; None where no lane contains the track.
 
     Parameters
     ----------
@@ -70,46 +69,55 @@ def choose_driven_lane(
         Of the markers, along and left of the track. [m]
     named : ndarray of int, shape (K,)
         `LaneSide` that each marker sends.
-    speed_m_s : float
-        Mean speed, after which a slow error of the receiver changes. [m/s]
     """
     beside = np.abs(left_m) < _HALF_GRID_M + _WIDTHS_M[-1]
     if beside.sum() < 2:
         return None
     stage = _stages(station_m[beside])
     grid: Floats = np.arange(-_HALF_GRID_M, _HALF_GRID_M + _GRID_M / 2, _GRID_M)
-    accuracy = drive.accuracy_m if np.isfinite(drive.accuracy_m) else _UNKNOWN_ACCURACY_M
+    accuracy = max(drive.accuracy_m if np.isfinite(drive.accuracy_m) else _UNKNOWN_ACCURACY_M, drive.jump_m)
     precise = accuracy < TRUSTED_TRACK_M
-    length_m = _PRECISE_LENGTH_M if precise else max(_SLOW_TIME_S * speed_m_s, _PRECISE_LENGTH_M)
+    length_m = _PRECISE_LENGTH_M if precise else max(_SLOW_TIME_S * drive.speed_m_s, _PRECISE_LENGTH_M)
     prior = np.minimum((grid / math.hypot(accuracy, _DRIVER_M)) ** 2, _MAX_PRIOR) * _STEP_M / length_m
     cost = _line_costs(stage, station_m[beside], left_m[beside], grid) + prior
     move_m = _MOVE_M if precise else _SLOW_MOVE_M
-    course, total = _cheapest(stage, grid, cost, move_m)
-    total += _ONCOMING_COST * _is_oncoming(course, station_m, left_m, named)
-    rivals = []
-    for away in (_apart_everywhere(course, grid), _apart_where_unsure(course, grid, cost, move_m)):
-        rival, more = _cheapest(stage, grid, cost + np.where(away, 0.0, 1e6)[:, None], move_m)
-        if more < 1e6:
-            rivals.append((more + _ONCOMING_COST * _is_oncoming(rival, station_m, left_m, named), rival))
-    for rival_total, rival in rivals:
-        if rival_total < total:
-            rivals = [(total, course), *(one for one in rivals if one[1] is not rival)]
-            course, total = rival, rival_total
-    if not _has_lines(course, station_m, left_m):
-        return None
-    others = tuple(rival for more, rival in rivals if more < total + _TIE and _has_lines(rival, station_m, left_m))
-    return DrivenLane(_sides_of(course, station_m, left_m), others, course)
-
-
-def describe_tie(chosen: DrivenLane, accuracy_m: float) -> str:
-    """Why the driven lane is not known, for people."""
-    centres = sorted(float(np.median(course.centre_m)) for course in (chosen.course, *chosen.others))
-    places = " and ".join(f"{abs(at):.1f} m {'left' if at > 0 else 'right'}" for at in centres)
-    good = f"accurate to {accuracy_m:.1f} m" if np.isfinite(accuracy_m) else "of unknown accuracy"
-    return (
-        f"several lanes are equally likely: their centres are {places} of the vehicle's track, and the receiver is "
-        f"{good}; a receiver with corrections shows which one is driven"
+    found = [_cheapest(stage, grid, cost, move_m)]
+    course = found[0][1]
+    for allowed in (_apart_everywhere(course, grid), _apart_where_unsure(course, grid, cost, move_m)):
+        found.append(_cheapest(stage, grid, cost + np.where(allowed, 0.0, _FORBIDDEN)[:, None], move_m))
+    lanes = sorted(
+        (
+            (total + _ONCOMING_COST * _is_oncoming(course, station_m, left_m, named), course)
+            for total, course in found
+            if total < _FORBIDDEN and _has_lines(course, station_m, left_m)
+        ),
+        key=lambda lane: lane[0],
     )
+    if not lanes:
+        return None
+    (least, course), *rivals = lanes
+    others = [rival for total, rival in rivals if total < least + _TIE and _farthest(course, rival)[1] >= _ANOTHER_M]
+    return DrivenLane(_sides_of(course, station_m, left_m), course, tuple(others))
+
+
+def describe_tie(chosen: DrivenLane, drive: DrivenLine) -> str:
+    """Why the driven lane is unknown, for people."""
+    at, _ = _farthest(chosen.course, chosen.others[0])
+    centres = sorted({float(course.centre_m[at]) for course in (chosen.course, *chosen.others)})
+    places = " and ".join(f"{abs(centre):.1f} m {'left' if centre > 0 else 'right'}" for centre in centres)
+    good = f"is accurate to {drive.accuracy_m:.1f} m" if np.isfinite(drive.accuracy_m) else "is of unknown accuracy"
+    if drive.jump_m > drive.accuracy_m:
+        good = f"jumps by {drive.jump_m:.1f} m"
+    return (
+        f"several lanes are equally likely: their centres are {places} of the vehicle's track, which {good}; send the "
+        "track of a receiver with RTK corrections"
+    )
+
+
+def _farthest(course: LaneCourse, other: LaneCourse) -> tuple[int, float]:
+    """The station where two lanes are farthest apart, and how far. [m]"""
+    apart = np.abs(course.centre_m - other.centre_m)
+    return int(np.argmax(apart)), float(apart.max())
 
 
 def _stages(station_m: Floats) -> Floats:
@@ -141,15 +149,14 @@ def _line_costs(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats
     return out
 
 
-def _cheapest(stage_m: Floats, grid: Floats, cost: Floats, move_m: float) -> tuple[LaneCourse, float]:
-    """The cheapest course (Viterbi algorithm), and what it costs."""
+def _cheapest(stage_m: Floats, grid: Floats, cost: Floats, move_m: float) -> tuple[float, LaneCourse]:
+    """The cheapest course (Viterbi algorithm), after what it costs."""
     total, came = _forward(cost, move_m)
-    at = int(np.argmin(total[-1]))
-    lowest, states = float(total[-1].flat[at]), [at]
+    states = [int(np.argmin(total[-1]))]
     for b in range(len(stage_m) - 1, 0, -1):
         states.append(int(came[b].flat[states[-1]]))
     width, offset = np.unravel_index(states[::-1], total.shape[1:])
-    return LaneCourse(stage_m, grid[offset], _WIDTHS_M[width]), lowest
+    return float(total[-1].min()), LaneCourse(stage_m, grid[offset], _WIDTHS_M[width])
 
 
 def _forward(cost: Floats, move_m: float) -> tuple[Floats, Ints]:

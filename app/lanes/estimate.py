@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+import scipy
 
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
@@ -24,7 +25,7 @@ from app.lanes.observations import LaneObservations, distinct_places, observatio
 from app.lanes.smooth_line import SmoothLine, boundaries_by_splines, plane_from_wgs84
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, Lane, LaneMarkers, LaneRules, LeftOut, LeftOutReason, Notes
 from app.sensors.pose_track import PoseTrack
-from app.values import Bools, Ints
+from app.values import Bools, Floats, Ints
 
 __all__ = ["Lane", "LaneMarkers", "LaneRules", "LeftOut", "LeftOutReason", "fit_lane", "preview_m"]
 
@@ -34,10 +35,16 @@ _TRACK_APART = (
 )
 _BEYOND_TRACK_M = 15.0  # [m] further past its ends a track is not used; sensitivity 1.00, 1.00
 _PRECISE_TRACK_M = 0.1  # [m] noise of a track that shows sides by itself; between RTK and other receivers
-_NO_LINE = "the markers share no line"
+_NOT_ALONG = (
+    "markers of several lanes were received, and the vehicle's track runs along none of them: the vehicle changes "
+    "lane, or its receiver is less accurate than it states"
+)
+_MAX_ACROSS_M = 1.6  # [m] that an accurate track moves across its lane; half of a lane
+_MAX_WITHIN = 2  # markers between the boundaries of a path: of a road that crosses, or spoofed
+_WITHIN_MARGIN_M = 0.6  # [m] from a boundary; `LaneDeclaration.off_the_line_m`
 _MIN_ROW = 4  # markers in each row of a double line
 _ROWS_M = 0.08  # [m] between the rows of a double line, at least; four times the survey's 0.02 m
-_ROW_GAP_SHARE = 0.3  # of the distance of two rows that is empty between them
+_ROW_SPREAD = 0.3  # of each row, in their distance; one row with normal errors has 0.38
 _MAX_BESIDE_TRACK_M = 4.0  # [m] such sides are of markers at most a lane's width away
 
 
@@ -82,8 +89,6 @@ def fit_lane(
     if method == "paper":
         return _fit_by_splines(observations, taken, line, notes)
     lane = _fit_by_least_squares(observations, taken, line, drive, rules, notes)
-    if (lane.refusal or "").startswith(_NO_LINE) and drive is not None and track is not None:
-        lane = _fit_driven_lane(observations, taken, drive, _mean_speed_m_s(track), rules, lane)
     if track is None:
         return lane
     agreement = compare_with_track(lane, track)
@@ -152,65 +157,6 @@ def _connected_markers(observations: LaneObservations, taken: Bools, rules: Lane
     return belongs
 
 
-# --- the driven lane among several --------------------------------------------------------------------------------
-
-
-def _fit_driven_lane(
-    observations: LaneObservations, taken: Bools, drive: DrivenLine, speed_m_s: float, rules: LaneRules, refused: Lane
-) -> Lane:
-    """Fit the lane that is driven, among the markers of several; the refused lane where there is none."""
-    half = rules.usual_width_m / 2
-    station, left = drive.line.project_markers(observations.point_m, observations.side, half)
-    chosen = choose_driven_lane(station[taken], left[taken], observations.side[taken], drive, speed_m_s)
-    if chosen is None:
-        return refused
-    notes = Notes()
-    if chosen.others:
-        return refused_path(observations, notes, describe_tie(chosen, drive.accuracy_m), "waymark")
-    side = np.zeros(len(taken), np.int64)
-    side[taken] = chosen.side
-    own = side != UNKNOWN
-    for _ in range(2):
-        lane = _fit_by_least_squares(replace(observations, side=side), own, drive.line, drive, rules, notes)
-        inner = own & ~_outer_rows(lane, observations, side)
-        if lane.refusal is not None or (inner == own).all():
-            break
-        own, notes = inner, Notes()
-    for k in np.flatnonzero(taken & ~own):
-        notes.left_out.append(
-            LeftOut(int(observations.row[k]), int(observations.number[k]), LeftOutReason.OTHER_LANE, float("nan"))
-        )
-    return replace(lane, left_out=tuple(notes.left_out))
-
-
-def _outer_rows(lane: Lane, observations: LaneObservations, side: Ints) -> Bools:
-    """Markers of the outer row where a boundary is a line of two rows: it belongs to the lane beside."""
-    first_row = np.full(len(side), -1)
-    for row, at in enumerate(observations.of_row.tolist()):
-        if at >= 0:
-            first_row[at] = row
-    residual = lane.residual_m[first_row]
-    outer = np.zeros(len(side), bool)
-    for which, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
-        rows = np.flatnonzero((side == which) & np.isfinite(residual))
-        if len(rows) < 2 * _MIN_ROW:
-            continue
-        off = sign * residual[rows]
-        ranked = np.sort(off)
-        gap = np.diff(ranked)[_MIN_ROW - 1 : len(off) - _MIN_ROW]
-        at = int(np.argmax(gap))
-        split = (ranked[at + _MIN_ROW - 1] + ranked[at + _MIN_ROW]) / 2
-        low, high = off[off < split], off[off >= split]
-        if gap[at] > _ROW_GAP_SHARE * (np.median(high) - np.median(low)) and np.median(high) - np.median(low) > _ROWS_M:
-            outer[rows[off >= split]] = True
-    return outer
-
-
-def _mean_speed_m_s(track: PoseTrack) -> float:
-    """Of a track while it moves. [m/s]"""
-    return track.driven_m() / max(float(np.ptp(track.time_s)), 1.0)
-
-
 # --- methods ------------------------------------------------------------------------------------------------------
 
 
@@ -239,10 +185,12 @@ def _fit_by_least_squares(
             found = fit.run()
     except np.linalg.LinAlgError:  # weights too different for float64
         return refused("the accuracies of markers and track are too different to be combined")
+    if not found and drive is not None and (lane := _fit_driven_lane(observations, taken, drive, rules, notes)):
+        return lane
     for k, (reason, off) in fit.left_out.items():
         notes.left_out.append(LeftOut(int(observations.row[k]), int(observations.number[k]), reason, off))
     if not found:
-        return refused(f"{_NO_LINE}: {len(fit.left_out)} of them lie off it")
+        return refused(f"the markers share no line: {len(fit.left_out)} of them lie off it")
     if _is_row_of_unknown_side(fit, observations, taken, drive):
         return refused("one row of markers, and nothing shows on which side of the lane it is")
     _warn_of_guessed_sides(fit, observations, drive, notes)
@@ -250,6 +198,77 @@ def _fit_by_least_squares(
     if not len(lane.sigma_m) or float(np.median(lane.sigma_m)) > rules.max_median_sigma_m:
         return refused("the markers are too few or too inaccurate to show where the lane runs")
     return lane
+
+
+def _fit_driven_lane(
+    observations: LaneObservations, taken: Bools, drive: DrivenLine, rules: LaneRules, notes: Notes
+) -> Lane | None:
+    """Fit the driven one of several lanes, or refuse it; None where the markers are of no more than one lane."""
+    half = rules.usual_width_m / 2
+    station, left = drive.line.project_markers(observations.point_m, observations.side, half)
+    chosen = choose_driven_lane(station[taken], left[taken], observations.side[taken], drive)
+    if chosen is None or (chosen.side != UNKNOWN).all():
+        return None
+    if chosen.others:
+        return refused_path(observations, notes, describe_tie(chosen, drive), "waymark")
+    if drive.accuracy_m < TRUSTED_TRACK_M and np.ptp(chosen.course.centre_m) > _MAX_ACROSS_M:
+        return refused_path(observations, notes, _NOT_ALONG, "waymark")
+    side = np.zeros(len(taken), np.int64)
+    side[taken] = chosen.side
+    sided = replace(observations, side=side)
+    lane = _fit_own_markers(sided, taken, side != UNKNOWN, drive, rules, notes)
+    inner = (side != UNKNOWN) & ~_of_outer_rows(lane, sided)
+    if lane.refusal is None and inner.sum() < (side != UNKNOWN).sum():
+        lane = _fit_own_markers(sided, taken, inner, drive, rules, notes)
+    if lane.refusal is None and _markers_within(lane, observations.point_m[taken], half) > _MAX_WITHIN:
+        return refused_path(observations, notes, _NOT_ALONG, "waymark")
+    return lane
+
+
+def _markers_within(lane: Lane, point_m: Floats, half_width_m: float) -> int:
+    """How many markers stand between the boundaries of a path, where there should be none."""
+    away, at = (np.asarray(found) for found in scipy.spatial.cKDTree(lane.position_enu_m).query(point_m))
+    half = lane.width_m[at] / 2
+    return int(np.sum(away < np.where(np.isfinite(half), half, half_width_m) - _WITHIN_MARGIN_M))
+
+
+def _fit_own_markers(
+    observations: LaneObservations, taken: Bools, own: Bools, drive: DrivenLine, rules: LaneRules, notes: Notes
+) -> Lane:
+    """Fit the driven lane to its own markers; the others are left out as another lane's."""
+    noted = notes.copy()
+    for k in np.flatnonzero(taken & ~own):
+        row, number = int(observations.row[k]), int(observations.number[k])
+        noted.left_out.append(LeftOut(row, number, LeftOutReason.OTHER_LANE, float("nan")))
+    return _fit_by_least_squares(observations, own, drive.line, drive, rules, noted)
+
+
+def _of_outer_rows(lane: Lane, observations: LaneObservations) -> Bools:
+    """Markers of the outer row of a double line, which is the boundary of the lane beside."""
+    known = observations.of_row >= 0
+    residual = np.full(len(observations.side), np.nan)
+    residual[observations.of_row[known]] = lane.residual_m[known]
+    outer = np.zeros(len(residual), bool)
+    for which, outwards in ((LEFT, 1.0), (RIGHT, -1.0)):
+        rows = np.flatnonzero((observations.side == which) & np.isfinite(residual))
+        if len(rows) < 2 * _MIN_ROW:
+            continue
+        off = outwards * residual[rows]
+        first, apart_m, spread_m = _split_in_two(np.sort(off))
+        if apart_m > _ROWS_M and spread_m < _ROW_SPREAD * apart_m:
+            outer[rows[off >= first]] = True
+    return outer
+
+
+def _split_in_two(ranked_m: Floats) -> tuple[float, float, float]:
+    """The two groups of ranked values that spread least: first value of the upper one, distance, and spread. [m]"""
+    best = (0.0, 0.0, np.inf)
+    for k in range(_MIN_ROW, len(ranked_m) - _MIN_ROW + 1):
+        low, high = ranked_m[:k], ranked_m[k:]
+        spread = float(np.sqrt((k * low.var() + (len(ranked_m) - k) * high.var()) / len(ranked_m)))
+        if spread < best[2]:
+            best = (float(high[0]), float(high.mean() - low.mean()), spread)
+    return best
 
 
 def _fit_by_splines(observations: LaneObservations, taken: Bools, line: SmoothLine | None, notes: Notes) -> Lane:

@@ -152,6 +152,8 @@ _MAX_PAUSE_S = 5.0  # [s] longer pauses are shortened to this; no effect on movi
 _BIN_S = 0.2  # [s] fixes are averaged over this; source: 2.8 m at 50 km/h, about one bin a knot
 _WILD_SIGMAS = 6.0  # fixes further off are left out; source: six sigma, never by chance in a drive
 _MAX_WILD_SHARE = 0.3  # more wild fixes are not wild but the track's usual error
+_JUMP_WITHIN_S = 1.0  # [s] a step between fixes farther apart may be the vehicle's
+_HARDEST_M_S2 = 20.0  # [m/s2] twice a full braking, since fixes are not evenly spaced
 _MIN_SIGMA_M = 0.02  # [m] source: RTK receivers, CERPM paper, section 2.2
 _NEAR_MARKERS_M = (
     1000.0  # [m] the track beyond is not used; source: several times the radio range of 340 m (paper, 4.1)
@@ -172,6 +174,8 @@ class DrivenLine:
     fix_m: Floats  # shape (F, 2): [m] fixes without outliers, at most one each metre
     sigma_m: float  # [m] standard deviation from one fix to the next
     accuracy_m: float  # [m] as reported by the receiver; NaN if it reports none
+    speed_m_s: float  # [m/s] mean
+    jump_m: float  # [m] largest step that no vehicle makes, as where a reflected signal appears; 0 without one
 
 
 def driven_line_from_track(track: PoseTrack, origin: tuple[float, float], markers_m: Floats) -> DrivenLine | None:
@@ -204,7 +208,9 @@ def driven_line_from_track(track: PoseTrack, origin: tuple[float, float], marker
     if len(kept) < 2:
         return None
     fine = _thin_out(fixes, 1.0) if sigma < _FINE_TRACK_M else fixes
-    return DrivenLine(SmoothLine(kept), fine, max(sigma, _MIN_SIGMA_M), accuracy)
+    line = SmoothLine(kept)
+    speed = line.length_m / max(float(np.ptp(time_binned)), _BIN_S)
+    return DrivenLine(line, fine, max(sigma, _MIN_SIGMA_M), accuracy, speed, _largest_jump_m(time, fixes, sigma))
 
 
 def _average_bins(time_s: Floats, fixes_m: Floats) -> tuple[Floats, Floats, Floats]:
@@ -222,6 +228,16 @@ def _noise(fixes_m: Floats) -> float:
         return _MIN_SIGMA_M
     third = np.diff(fixes_m, 3, axis=0)
     return max(float(_MAD_TO_SIGMA * np.median(np.abs(third)) / np.sqrt(20.0)), 0.5 * _MIN_SIGMA_M)
+
+
+def _largest_jump_m(time_s: Floats, fixes_m: Floats, sigma_m: float) -> float:
+    """The largest step between fixes that neither their noise nor a vehicle's acceleration explains. [m]"""
+    step_s = np.maximum(np.diff(time_s), 1e-3)
+    velocity = np.diff(fixes_m, axis=0) / step_s[:, None]
+    off = np.hypot(*(np.diff(velocity, axis=0) * step_s[1:, None]).T)
+    near = np.maximum(step_s[1:], step_s[:-1]) < _JUMP_WITHIN_S
+    jump = off > _WILD_SIGMAS * sigma_m * np.sqrt(6.0) + _HARDEST_M_S2 * step_s[1:] ** 2
+    return float(off[near & jump].max(initial=0.0))
 
 
 def _smoothed(time_s: Floats, binned_m: Floats, weight: Floats, sigma_m: float) -> Floats:

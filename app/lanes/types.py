@@ -125,7 +125,7 @@ class LeftOutReason(StrEnum):
     APART = "apart"
     """It is too far from the rest to belong to the same stretch of lane."""
     OTHER_LANE = "other_lane"
-    """It is on no boundary of the lane that is driven: another lane's marker."""
+    """It is another lane's marker: it is on no boundary of the driven lane."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,6 +229,10 @@ class Notes:
 
     left_out: list[LeftOut] = field(default_factory=list)
     localization_warnings: list[str] = field(default_factory=list)
+
+    def copy(self) -> Notes:
+        """The same so far."""
+        return Notes(list(self.left_out), list(self.localization_warnings))
 
     def warn(self, text: str) -> None:
         """Add a warning, once."""

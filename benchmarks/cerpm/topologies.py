@@ -72,36 +72,40 @@ def _lane(left_m: Floats, right_m: Floats) -> TrueLane:
     return lane_between(left_m[::8], right_m[::8], _ORIGIN)
 
 
-def _build(driven: TrueLane, lanes: list[tuple[TrueLane, bool, bool]], rng: np.random.Generator) -> Topology:
+def _build(
+    driven: TrueLane, lanes: list[tuple[TrueLane, bool, bool]], rng: np.random.Generator, first: int = 1
+) -> Topology:
     """Markers of lanes, each with whether its left and its right row are installed."""
     parts: list[InstalledMarkers] = []
-    first = 1
     for lane, left, right in lanes:
         places = place_markers(lane.left_m, lane.right_m)
         kept: list[MarkerPlace] = [place for place in places if (left if place.side == LaneSide.LEFT else right)]
         part = install_markers(lane, kept, rng, speed_limit=LIMIT, survey_sd_m=SURVEY_M, first_number=first)
         first += len(part)
         parts.append(part)
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("number", "side", "chainage_m", "point_m", "lon_deg", "lat_deg", "broadcast_side")
-    }
+    return _topology(driven, parts)
+
+
+def _topology(driven: TrueLane, parts: list[InstalledMarkers]) -> Topology:
+    """A road with the markers of several lanes, whose numbers differ."""
+    names = ("number", "side", "chainage_m", "point_m", "lon_deg", "lat_deg", "broadcast_side")
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     installed = replace(parts[0], **arrays)
     beside = np.minimum(_nearest_m(installed.point_m, driven.left_m), _nearest_m(installed.point_m, driven.right_m))
-    return Topology(driven, installed, frozenset(installed.number[beside < 0.08].tolist()))
+    return Topology(driven, installed, frozenset(installed.number[beside < _ROW_M / 2].tolist()))
 
 
 def _nearest_m(points_m: Floats, line_m: Floats) -> Floats:
     return np.asarray(shapely.distance(shapely.points(points_m), shapely.linestrings(line_m)))
 
 
-def _beside(rng: np.random.Generator, count: int, shared: bool, driven: int | None = None) -> Topology:
+def _beside(rng: np.random.Generator, count: int, shared: bool) -> Topology:
     """Lanes of one direction beside each other, the first on the right."""
     base, width = _base(rng), float(rng.uniform(3.0, 3.7))
     edges = [(k - count / 2) * width for k in range(count + 1)]
     gap = 0.0 if shared else _ROW_M / 2
     lanes = [_lane(_offset(base, edges[k + 1] - gap), _offset(base, edges[k] + gap)) for k in range(count)]
-    which = int(rng.integers(count)) if driven is None else driven
+    which = int(rng.integers(count))
     rows = [(lane, True, k == 0 or not shared) for k, lane in enumerate(lanes)]
     return _build(lanes[which], rows, rng)
 
@@ -122,21 +126,10 @@ def _ramp(rng: np.random.Generator, merges: bool, driven_ramp: bool) -> Topology
     main = _lane(_offset(base, width / 2), _offset(base, -width / 2))
     ramp_left, ramp_right = -width / 2 - away, -width / 2 - away - width
     ramp = _lane(_offset(base, ramp_left), _offset(base, ramp_right))
-    joined = share >= 1  # there the line between them is marked once
-    ramp_part = _build(ramp, [(ramp, True, True)], rng)
-    main_part = _build(main, [(main, True, True)], rng)
-    away_ramp = _nearest_m(ramp_part.installed.point_m, _offset(base, -width / 2)) > 0.3
-    kept = ramp_part.installed.chosen(away_ramp)
-    kept = replace(kept, number=kept.number + int(main_part.installed.number.max()))
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(main_part.installed, name), getattr(kept, name)])
-        for name in ("number", "side", "chainage_m", "point_m", "lon_deg", "lat_deg", "broadcast_side")
-    }
-    assert joined.any()
-    installed = replace(main_part.installed, **arrays)
-    driven = ramp if driven_ramp else main
-    beside = np.minimum(_nearest_m(installed.point_m, driven.left_m), _nearest_m(installed.point_m, driven.right_m))
-    return Topology(driven, installed, frozenset(installed.number[beside < 0.08].tolist()))
+    on_main = _build(main, [(main, True, True)], rng).installed
+    on_ramp = _build(ramp, [(ramp, True, True)], rng, first=len(on_main) + 1).installed
+    shared = _nearest_m(on_ramp.point_m, main.right_m) < 0.3  # there the line between them is marked once
+    return _topology(ramp if driven_ramp else main, [on_main, on_ramp.chosen(~shared)])
 
 
 def _crossing(rng: np.random.Generator) -> Topology:
@@ -204,23 +197,18 @@ def _u_turn(rng: np.random.Generator) -> Topology:
     own = _around(line, half, half)
     ahead = np.array([math.cos(heading), math.sin(heading)])
     out = np.linspace(0, 300, 1201)[:, None] * ahead
-    back = line[-1] - np.linspace(300, 0, 1201)[:, None] * ahead * -1
-    return _with_others(own, [_around(out, half, half), _around(back[::1], half, half)], rng)
+    back = line[-1] + np.linspace(300, 0, 1201)[:, None] * ahead
+    return _with_others(own, [_around(out, half, half), _around(back, half, half)], rng)
 
 
 def _with_others(own: TrueLane, others: list[TrueLane], rng: np.random.Generator) -> Topology:
     """The driven lane, and those markers of other lanes that stand neither on it nor on its boundaries."""
     parts = [_build(own, [(own, True, True)], rng).installed]
     for lane in others:
-        part = _build(lane, [(lane, True, True)], rng).installed
+        part = _build(lane, [(lane, True, True)], rng, first=int(parts[-1].number.max()) + 1).installed
         on = _nearest_m(part.point_m, own.centre_m) < float(own.width_m.max()) / 2 + 0.6
-        part = part.chosen(~on)
-        parts.append(replace(part, number=part.number + int(parts[-1].number.max())))
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("number", "side", "chainage_m", "point_m", "lon_deg", "lat_deg", "broadcast_side")
-    }
-    return Topology(own, replace(parts[0], **arrays), frozenset(parts[0].number.tolist()))
+        parts.append(part.chosen(~on))
+    return _topology(own, parts)
 
 
 TOPOLOGIES: dict[str, Callable[[np.random.Generator], Topology]] = {

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from app.lanes.estimate import fit_lane
-from app.lanes.types import LeftOutReason
-from app.simulation.radio.drive import SatelliteReceiver
+from app.lanes.types import LaneMarkers, LeftOutReason
+from app.simulation.radio.drive import Multipath, SatelliteReceiver
 from benchmarks.cerpm.path_errors import place_errors
 from benchmarks.cerpm.scenes import markers_for_lane, track
 from benchmarks.cerpm.topologies import TOPOLOGIES, make_topology
@@ -21,8 +21,8 @@ def test_the_driven_lane_is_found_with_rtk(name: str) -> None:
     assert lane.refusal is None
     errors = place_errors(road.lane, lane, 30.0, road.lane.length_m - 30.0)
     assert errors is not None
-    assert errors.rms_m < 0.06
-    assert errors.worst_m < 0.3
+    assert errors.rms_m < 0.045
+    assert errors.worst_m < 0.2
 
 
 def test_lanes_that_a_coarse_receiver_cannot_tell_apart_are_named() -> None:
@@ -40,3 +40,31 @@ def test_markers_of_the_other_lane_are_said_to_be_its_own() -> None:
     lane = fit_lane(markers_for_lane(road.installed), track(road.lane, rng))
     others = {out.number for out in lane.left_out if out.reason is LeftOutReason.OTHER_LANE}
     assert others == set(road.installed.number.tolist()) - road.own
+
+
+def test_markers_that_were_left_out_before_stay_listed() -> None:
+    rng = np.random.default_rng(74)
+    road = make_topology("three lanes", rng)
+    markers = markers_for_lane(road.installed)
+    twice = np.append(np.arange(len(markers)), 0)  # the first number is received in a second place
+    lat_deg = markers.lat_deg[twice]
+    lat_deg[-1] += 1e-4
+    columns = (markers.number, markers.lon_deg, lat_deg, markers.side, markers.sigma_m, markers.speed_limit_kmh)
+    heard = LaneMarkers(*(column if column is lat_deg else column[twice] for column in columns))
+    lane = fit_lane(heard, track(road.lane, rng))
+    assert lane.refusal is None
+    reasons = {out.number: out.reason for out in lane.left_out}
+    assert reasons[int(markers.number[0])] is LeftOutReason.TWO_PLACES
+    assert LeftOutReason.OTHER_LANE in reasons.values()
+
+
+def test_a_track_that_jumps_between_lanes_gives_no_path_in_the_wrong_one() -> None:
+    jumping = SatelliteReceiver(0.008, 0.018, 20.0, 0.3, 0.02, 20.0, multipath=Multipath(step_sd_m=1.5))
+    worst_m = []
+    for seed in range(75, 81):
+        rng = np.random.default_rng(seed)
+        road = make_topology("two lanes, shared line", rng)
+        lane = fit_lane(markers_for_lane(road.installed), track(road.lane, rng, jumping))
+        errors = place_errors(road.lane, lane, 30.0, road.lane.length_m - 30.0) if lane.refusal is None else None
+        worst_m.append(0.0 if errors is None else errors.worst_m)
+    assert max(worst_m) < 1.0
