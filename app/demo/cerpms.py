@@ -83,9 +83,13 @@ def load_lane() -> TrueLane:
 
 
 def build_lane(client: httpx.Client, rng: np.random.Generator) -> BuiltLane:
-    """Place markers along the lane, survey them, register them, and fetch what they are programmed with."""
+    """Place markers along the demo's lane, survey them, and register them."""
     lane = load_lane()
-    installed = install_markers(lane, place_markers(lane.left_m, lane.right_m), rng)
+    return register_lane(client, lane, install_markers(lane, place_markers(lane.left_m, lane.right_m), rng))
+
+
+def register_lane(client: httpx.Client, lane: TrueLane, installed: InstalledMarkers) -> BuiltLane:
+    """Register the markers of a road with a lane, and fetch what they are programmed with."""
     markers = [
         checked(
             client.post(

@@ -208,6 +208,11 @@ class Lane:
     track_apart: bool = False
 
     @property
+    def of_other_lanes(self) -> frozenset[int]:
+        """Numbers of markers that are on no boundary of this lane, but of another one."""
+        return frozenset(out.number for out in self.left_out if out.reason is LeftOutReason.OTHER_LANE)
+
+    @property
     def east_m(self) -> Floats:
         """East of the origin, shape (S,). [m]"""
         return self.position_enu_m[:, 0]

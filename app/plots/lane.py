@@ -107,7 +107,7 @@ _PLAN_TOP, _MIN_PLAN, _MAX_PLAN = 66, 130, 380  # [px]
 _STRIP, _SIGMA = 150, 86  # [px] heights of the panels below the plan
 _MIN_M, _MARGIN_PX = (30.0, 6.0), 26
 _MAX_LABELS, _MAX_TITLES = 14, 400
-_SIDE_COLOURS = {0: "#7d3c98", 1: BLUE, 2: ORANGE}
+_SIDE_COLOURS = {-1: GREY, 0: "#7d3c98", 1: BLUE, 2: ORANGE}
 _CENTRE, _TRACK, _OUT = "#2d3e50", GREEN, RED
 _CONFIDENCE, _CONFIDENCE_LABEL, _TICK = "#8fb7b2", "#4e8a83", "#aaa"
 
@@ -126,7 +126,7 @@ class LanePicture:
     sigma_m: Floats
     confidence: Floats
     marker_m: Floats  # shape (K, 2): [m] NaN where a marker has no place
-    # `marker_number`, `marker_side`: shape (K,): sides as in `LaneSide`: 0 unknown, 1 left, 2 right
+    # `marker_number`, `marker_side`: shape (K,): sides as in `LaneSide`: 0 unknown, 1 left, 2 right; -1 in another lane
     marker_number: Ints
     marker_side: Ints
     left_out: dict[int, str] = field(default_factory=dict)  # why markers were left out, by their row
@@ -141,6 +141,7 @@ def picture_of_lane(lane: Lane, markers: LaneMarkers, track: PoseTrack | None = 
     earthly = (np.abs(markers.lat_deg) <= 90) & (np.abs(markers.lon_deg) <= 360)
     marker_m = np.full((len(markers), 2), np.nan)
     marker_m[earthly] = plane_from_wgs84(markers.lon_deg[earthly], markers.lat_deg[earthly], origin)
+    elsewhere = np.isin(markers.number, list(lane.of_other_lanes))
     return LanePicture(
         lane.position_enu_m,
         lane.left_enu_m,
@@ -150,8 +151,8 @@ def picture_of_lane(lane: Lane, markers: LaneMarkers, track: PoseTrack | None = 
         lane.confidence,
         marker_m,
         markers.number,
-        np.where(lane.side > 0, lane.side, markers.side),
-        {out.row: out.reason.value.replace("_", " ") for out in lane.left_out},
+        np.where(elsewhere, -1, np.where(lane.side > 0, lane.side, markers.side)),
+        {out.row: out.reason.value.replace("_", " ") for out in lane.left_out if not elsewhere[out.row]},
         np.empty((0, 2)) if track is None else plane_from_wgs84(track.lon_deg, track.lat_deg, origin),
         lane.refusal,
     )
@@ -163,8 +164,8 @@ def plot_lane(lane: LanePicture, signals: SignalPicture | None = None) -> str:
     From top to bottom: the lane from above at one scale, turned so that it lies along the page; the same straightened,
     metres to the left and right of its centre line, so that markers and the track can be seen beside it on long lanes;
     its standard deviation and confidence along the way; RSSI over distance with the fitted line and the paper's two
-    points. Markers are blue left, orange right and violet without a side; those left out are crossed out in red, with
-    number and reason.
+    points. Markers are blue left, orange right, violet without a side and grey in another lane; those left out are
+    crossed out in red, with number and reason.
     """
     view = _plan_view(lane)
     parts = [heading(_LEFT, 20, _title(lane)), _legend(), *_without_position(lane)]
@@ -188,8 +189,10 @@ def plot_lane(lane: LanePicture, signals: SignalPicture | None = None) -> str:
 
 def _title(lane: LanePicture) -> str:
     out = len(lane.left_out)
-    used = len(lane.marker_m) - out
-    markers = f"{used} marker{'s' * (used != 1)}" + (f", {out} left out" if out else "")
+    others = int((lane.marker_side == -1).sum())
+    used = len(lane.marker_m) - out - others
+    markers = f"{used} marker{'s' * (used != 1)}"
+    markers += (f", {others} of other lanes" if others else "") + (f", {out} left out" if out else "")
     if len(lane.centre_m) < 2:
         return f"No lane: {lane.refusal or 'no path'}; {markers}"
     length = _length_text(float(lane.station_m[-1] - lane.station_m[0]))
@@ -205,7 +208,7 @@ def _length_text(length_m: float) -> str:
 def _legend() -> str:
     entries = [
         ("● left", _SIDE_COLOURS[1], False), ("● right", _SIDE_COLOURS[2], False),
-        ("● no side", _SIDE_COLOURS[0], False), ("✕ left out", _OUT, False),
+        ("● no side", _SIDE_COLOURS[0], False), ("● other lane", _SIDE_COLOURS[-1], False), ("✕ left out", _OUT, False),
         ("— centre line", _CENTRE, True), ("‒ ‒ vehicle", _TRACK, False),
     ]  # fmt: skip
     gap = ("     ", "", False)

@@ -7,6 +7,7 @@ import pytest
 
 from app.lanes.estimate import fit_lane
 from app.lanes.types import LaneMarkers, LeftOutReason
+from app.plots.lane import picture_of_lane, plot_lane
 from app.simulation.radio.drive import Multipath, SatelliteReceiver
 from benchmarks.cerpm.path_errors import place_errors
 from benchmarks.cerpm.scenes import markers_for_lane, track
@@ -38,8 +39,10 @@ def test_markers_of_the_other_lane_are_said_to_be_its_own() -> None:
     rng = np.random.default_rng(73)
     road = make_topology("frontage road", rng)
     lane = fit_lane(markers_for_lane(road.installed), track(road.lane, rng))
-    others = {out.number for out in lane.left_out if out.reason is LeftOutReason.OTHER_LANE}
-    assert others == set(road.installed.number.tolist()) - road.own
+    assert lane.of_other_lanes == set(road.installed.number.tolist()) - road.own
+    drawn = plot_lane(picture_of_lane(lane, markers_for_lane(road.installed)))
+    assert f"{len(lane.of_other_lanes)} of other lanes" in drawn
+    assert "left out;" not in drawn
 
 
 def test_markers_that_were_left_out_before_stay_listed() -> None:

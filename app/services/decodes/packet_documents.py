@@ -184,7 +184,7 @@ def _path_warnings(lane: Lane) -> list[str]:
 
 def packet_observations(read: ReadPackets, lane: Lane, observed_at: datetime) -> list[NewObservation]:
     """One row for each registered marker whose packets were authentic."""
-    off_line = {entry.number for entry in lane.left_out}
+    off_line = {entry.number for entry in lane.left_out} - lane.of_other_lanes
     kinds = {finding.number: _OBSERVED.get(finding.kind) for finding in read.merged.findings}
     far = [number for number, kind in kinds.items() if kind == _OBSERVED[Disagreement.OUT_OF_REACH]]
     if 2 * len(far) > len(read.signal.profiles):
@@ -206,13 +206,15 @@ def _summary(files: DriveFiles, read: ReadPackets, markers: list[ReceivedMarkerD
         counts[verdict] for verdict in (Verdict.AUTHENTIC, Verdict.DUPLICATE, Verdict.UNAUTHENTICATED)
     )
     refused = len(files.packets) - accepted - repeated - clear
-    named = [marker["number"] for marker in markers if marker["left_out"]]
+    others = lane.of_other_lanes
+    named = [marker["number"] for marker in markers if marker["left_out"] and marker["number"] not in others]
     length_m = float(lane.station_m[-1]) if len(lane.station_m) else 0.0
     text = f"{count_of(len(files.packets), 'packet')}, {accepted} authentic"
     text += f", {repeated} repeated" if repeated else ""
     text += f", {clear} in clear" if clear else ""
     text += f", {refused} refused" if refused else ""
     text += f"; {count_of(len(markers), 'marker')}"
+    text += f", {len(others)} of other lanes" if others else ""
     text += f", left out: {', '.join(str(number) for number in named)}" if named else ""
     if lane.refusal is None and np.isfinite(lane.sigma_m).all():
         text += f"; path of {length_m:.0f} m, ± {100 * float(np.median(lane.sigma_m)):.1f} cm"

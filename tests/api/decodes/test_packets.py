@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from app.demo.cerpms import BuiltLane, build_lane, draw_frame, path_errors_m, write_packets, write_poses
+from app.demo.cerpms import BuiltLane, build_lane, draw_frame, path_errors_m, register_lane, write_packets, write_poses
 from app.encoders.cerpm import encode_message
 from app.errors import TooManyRequests
 from app.main import create_app
@@ -35,6 +35,7 @@ from app.simulation.radio.attacks import forge_packets, move_claim, number_entri
 from app.simulation.radio.drive import SimulatedDrive, drive_past
 from app.simulation.radio.lanes import InstalledMarkers
 from app.simulation.radio.link import Radio
+from benchmarks.cerpm.topologies import make_topology
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.http import finished
 from tests.jobs import standin
@@ -95,6 +96,26 @@ def path_rms_m(built: BuiltLane, found: dict[str, Any]) -> float:
     errors, covered = path_errors_m(built.lane, built.lane.enu_from_wgs84(stations["lon_deg"], stations["lat_deg"]))
     assert covered > 0.99
     return float(np.sqrt(np.mean(errors**2)))
+
+
+# --- roads with more than one lane --------------------------------------------------------------------------------
+
+
+def test_a_road_of_two_lanes_gives_the_driven_one(server: LiveServer) -> None:
+    with server.agency(f"roads {next(_AGENCIES)}", Scope.ADMIN) as client:
+        two = make_topology("two lanes, shared line", np.random.default_rng(1951))
+        built = register_lane(client, two.lane, two.installed)
+        heard, _hour = drive(built, 1952)
+        found = decoded(client, packed(heard))
+        others = {marker["number"] for marker in found["markers"] if marker["left_out"]}
+        assert others == set(two.installed.number.tolist()) - two.own
+        assert f"{len(others)} of other lanes" in found["summary"]["text"]
+        assert found["summary"]["left_out"] == []
+        assert path_rms_m(built, found) < 0.03
+        assert found["lane"]["localization_grade"] == "cm", found["lane"]["localization_warnings"]
+        assert all(marker["registered"] and marker["authentic"] for marker in found["markers"])
+        seen = client.get(f"/v1/markers/{built.markers[-1]['id']}/observations").json()
+        assert [one["what"] for one in seen["items"]] == ["seen"]
 
 
 # --- what a drive gives -------------------------------------------------------------------------------------------
