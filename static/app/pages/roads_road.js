@@ -1,7 +1,7 @@
 // One registered road: its axis with stations on the map, its markers along its measures, its calibration and history.
 
 import { html } from "htm/preact";
-import { useMemo, useState } from "preact/hooks";
+import { useMemo, useRef, useState } from "preact/hooks";
 
 import { api, ok, page } from "../api/client.js";
 import { Facts } from "../components/facts.js";
@@ -22,6 +22,7 @@ const MAX_TICKS = 12;
 /** @param {{ parameters: { road_id: string } }} props */
 export default function RoadPage({ parameters }) {
   const id = parameters.road_id;
+  const changed = useRef(false);
   const found = useLoad(async (signal) => {
     const path = { road_id: id };
     const road = await ok(api.GET("/v1/roads/{road_id}", { params: { path }, signal }));
@@ -30,11 +31,17 @@ export default function RoadPage({ parameters }) {
       stationPlaces(road, signal),
       may("GET /v1/alignments") ? allOf((after) => page(api.GET("/v1/alignments", { params: { query: { limit: 1000, ...(after ? { after } : {}) } }, signal }))) : [],
     ]);
+    if (changed.current) setQuery({ edit: null }); // only now: a form that is opened meanwhile would show the old version
+    changed.current = false;
     return { road, markers, ticks, alignments: alignments.filter(({ declaration }) => declaration.road_id === id) };
   }, [id]);
+  const reload = () => {
+    changed.current = true;
+    found.reload();
+  };
   return html`
     <h1>${found.data?.road.name ?? t("roads.title")}</h1>
-    <${Shown} of=${found}>${(/** @type {any} */ data) => html`<${Road} key=${`${id} ${data.road.version}`} ...${data} onChanged=${found.reload} />`}</${Shown}>
+    <${Shown} of=${found}>${(/** @type {any} */ data) => html`<${Road} key=${`${id} ${data.road.version}`} ...${data} onChanged=${reload} />`}</${Shown}>
   `;
 }
 
@@ -83,7 +90,6 @@ function Road({ road, markers, ticks, alignments, onChanged }) {
     ${editing && html`<section class="card" aria-label=${t("roads.edit")}><p class="hint">${t("roads.edit_text")}</p>
       <${AxisForm} road=${road} onStored=${(/** @type {any} */ stored) => {
         notify(t("roads.changed", { name: stored.name, version: stored.version }));
-        setQuery({ edit: null });
         onChanged();
       }} /></section>`}
     <section class="plan-view" aria-label=${t("plan.view")}>
