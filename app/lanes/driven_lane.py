@@ -1,20 +1,23 @@
-"""The driven lane among several marked lanes.
+"""The driven lane among several marked lanes, and the lanes beside it.
 
 A vehicle hears the markers of all lanes within radio range. Along its track the centre and the width of a lane are
 followed by dynamic programming. At a station a lane costs little where there are markers on both of its boundaries,
-none within, and its centre is as near to the track as the receiver's error and the driver's habits explain. How many
-markers a line has is no evidence, and the sides that markers send decide only which lanes are oncoming ones: a line
-that two lanes share is left of one and right of the other.
+none within, and its centre is as near to the track as the receiver's error and the driver's habits explain. A vehicle
+that changes lane crosses a boundary: its lane is then the next one. How many markers a line has is no evidence, and the
+sides that markers send decide only which lanes are oncoming ones: a line that two lanes share is left of one and right
+of the other. How strongly markers were received while the vehicle passed them shows which of them are near.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from app.compiled import ieee_kernel
 from app.lanes.initial_line import TRUSTED_TRACK_M, DrivenLine
 from app.lanes.types import LEFT, RIGHT, UNKNOWN
 from app.values import Bools, Floats, Ints
@@ -29,26 +32,90 @@ _NO_LINE_COST = 4.0  # squared sigmas, where no marker is on a boundary
 _WITHIN_COST, _WITHIN_MARGIN_M, _WITHIN_REACH_M = 6.0, 0.7, 10.0  # [1, m, m] of a marker between the boundaries
 _MAX_WITHIN = 2  # such markers that count at a station: one or two may be spoofed
 _DRIVER_M = 0.4  # [m] of a vehicle from its lane's centre: wander, habit, and bends that are cut
-_MAX_PRIOR = 25.0  # squared sigmas; a vehicle that changes lane is far from each of them for a while
+_MAX_PRIOR = 25.0  # squared sigmas
 _PRECISE_LENGTH_M, _SLOW_TIME_S = 30.0, 30.0  # [m, s] after which an offset is another one: a driver's, a receiver's
 _MOVE_M, _SLOW_MOVE_M = 0.25, 0.4  # [m] of the centre, beside the track, from station to station
+_ALONG_LINE_M = 0.18  # [m] of the centre, beside the direction of the lines, from station to station
 _MAX_MOVE = 5  # grid steps from station to station
 _WIDTH_COST = 2.0  # of a width that changes by a step of 0.2 m
+_CHANGE_COST, _CHANGING_COST = 8.0, 2.0  # squared sigmas for a change of lane, and for each station while it lasts
+_CROSSING_M = 0.8  # [m] of a vehicle from the line that it crosses, at the nearest station
+_MAX_CHANGE_MOVE_COST = 3.0  # squared sigmas, of lines that leave their direction while the vehicle changes lane
+_SLOPE_REACH_M, _PAIR_M = 20.0, (5.0, 20.0)  # [m] from a station, and between markers whose direction is a line's
+_MAX_SLOPE, _SLOPE_STEP, _SLOPE_ACROSS_M = 0.24, 0.01, 2.5  # [m/m, m/m, m] of directions that are compared
+_PAIR_ACROSS_M = 2.4  # [m] between such markers; those of neighbouring lines are farther apart
+_MIN_PAIRS = 0.8  # that agree
 _UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none
 _ANOTHER_M = 1.3  # [m] centres further apart are of two lanes; half of the narrowest
 _TIE = 14.0  # squared sigmas; odds of 1 to 1,100
+_BOTH_LANES = 3  # stations before and after a line is crossed
+_TRACE_M = 1.1  # [m] of a lane's centre from where it was expected
+_NEARER_COST = 0.05  # [1/m] squared sigmas at each station, so that the next lane comes before the one after it
+_MIN_STRETCH, _MAX_BESIDE = 5, 2  # stations of a lane that is named, and such lanes on each side
+_COARSE_CHANGE_TIE = 35.0  # squared sigmas; an inaccurate receiver's slow errors look like changes of lane
+_MAX_RIVALS = 4  # lanes that are compared with the driven one
 _ONCOMING_COST = 30.0  # squared sigmas for a lane whose both boundaries send the other side
 _ONCOMING_SHARE = 0.7  # of the markers on each boundary that send the other side
 _FORBIDDEN = 1e6  # cost of a state that a course may not have; above every course
 _ON_BOUNDARY_M = 0.9  # [m] of a marker from a boundary of its lane
+_PASSING_M = 25.0  # [m] from the vehicle along and across; farther markers do not show in which lane it is
+_MIN_PASSING = 10  # packets of markers that are passed
+_ANTENNA_M = 1.5  # [m] of the vehicle's antenna above the markers
+_EXPONENT, _EXPONENT_SD, _LEVEL_SD_DB = 2.0, 0.5, 1000.0  # of free space, with what roads and antennas change
+_SIDES_SD_DB = 1.5  # [dB] of half the difference between the sides of the vehicle
+_STRENGTH_SD_DB = 5.0  # [dB] of one marker: shadows and fading
+_MAX_STRENGTH_COST = 60.0  # squared sigmas
+_KEEPING, _LEFT_BEFORE, _LEFT_AFTER, _RIGHT_BEFORE, _RIGHT_AFTER = range(5)  # before and after the line is crossed
+_REVERSED = np.array([_KEEPING, _RIGHT_AFTER, _RIGHT_BEFORE, _LEFT_AFTER, _LEFT_BEFORE])  # in a drive run backwards
 
 
 class LaneCourse(NamedTuple):
-    """A lane beside the track."""
+    """The lane of the vehicle beside the track; from where it changes lane, the next one."""
 
     station_m: Floats  # shape (B,)
     centre_m: Floats  # shape (B,): [m] left of the track
     width_m: Floats  # shape (B,)
+    lane: Ints  # shape (B,): lanes left of the one in which the vehicle is at the end
+    doing: Ints  # shape (B,): whether the vehicle keeps its lane, or changes it
+
+    @property
+    def changing(self) -> Bools:
+        """Where the vehicle changes lane, shape (B,)."""
+        return np.asarray(self.doing != _KEEPING)
+
+    @property
+    def vehicle_m(self) -> Floats:
+        """Place of the vehicle, left of the track, shape (B,): its lane's centre, but where it changes lane. [m]"""
+        out = self.centre_m.copy()
+        edges = [0, *(np.flatnonzero(np.diff(self.doing)) + 1).tolist(), len(out)]
+        for start, end in itertools.pairwise(edges):
+            doing = int(self.doing[start])
+            if doing != _KEEPING:
+                to_left = 1.0 if doing in (_LEFT_BEFORE, _LEFT_AFTER) else -1.0
+                share = (np.arange(end - start) + 0.5) / (end - start)
+                share = share if doing in (_LEFT_BEFORE, _RIGHT_BEFORE) else share - 1.0
+                out[start:end] += to_left * share * self.width_m[start:end] / 2
+        return out
+
+
+class Passing(NamedTuple):
+    """Packets of markers that the vehicle passed, each of shape (P,)."""
+
+    row: Ints  # of the marker
+    along_m: Floats  # [m] of the marker ahead of the vehicle
+    rssi_dbm: Floats
+
+
+NOTHING_PASSED = Passing(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+
+
+class CourseBeside(NamedTuple):
+    """A lane beside the driven one."""
+
+    position: int  # lanes to the left of the driven one
+    oncoming: bool | None  # None where the sides that its markers send do not show it
+    course: LaneCourse
+    side: Ints  # shape (K,): boundary that each marker is on; UNKNOWN for those of other lanes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,9 +125,13 @@ class DrivenLane:
     side: Ints  # shape (K,): boundary that each marker is on; UNKNOWN for those of other lanes
     course: LaneCourse
     others: tuple[LaneCourse, ...]  # equally likely lanes; none where the driven one is certain
+    last: LaneCourse  # the lane in which the vehicle is at the end, along the whole track
+    beside: tuple[CourseBeside, ...]  # other lanes
 
 
-def choose_driven_lane(station_m: Floats, left_m: Floats, named: Ints, drive: DrivenLine) -> DrivenLane | None:
+def choose_driven_lane(
+    station_m: Floats, left_m: Floats, named: Ints, drive: DrivenLine, passing: Passing = NOTHING_PASSED
+) -> DrivenLane | None:
     """Find the driven lane among all markers beside a track; None where no lane contains the track.
 
     Parameters
@@ -69,35 +140,34 @@ def choose_driven_lane(station_m: Floats, left_m: Floats, named: Ints, drive: Dr
         Of the markers, along and left of the track. [m]
     named : ndarray of int, shape (K,)
         `LaneSide` that each marker sends.
+    passing : Passing
+        How strongly markers were received that the vehicle passed.
     """
     beside = np.abs(left_m) < _HALF_GRID_M + _WIDTHS_M[-1]
     if beside.sum() < 2:
         return None
     stage = _stages(station_m[beside])
-    grid: Floats = np.arange(-_HALF_GRID_M, _HALF_GRID_M + _GRID_M / 2, _GRID_M)
-    accuracy = max(drive.accuracy_m if np.isfinite(drive.accuracy_m) else _UNKNOWN_ACCURACY_M, drive.jump_m)
-    precise = accuracy < TRUSTED_TRACK_M
-    length_m = _PRECISE_LENGTH_M if precise else max(_SLOW_TIME_S * drive.speed_m_s, _PRECISE_LENGTH_M)
-    prior = np.minimum((grid / math.hypot(accuracy, _DRIVER_M)) ** 2, _MAX_PRIOR) * _STEP_M / length_m
-    cost = _line_costs(stage, station_m[beside], left_m[beside], grid) + prior
-    move_m = _MOVE_M if precise else _SLOW_MOVE_M
-    found = [_cheapest(stage, grid, cost, move_m)]
-    course = found[0][1]
-    for allowed in (_apart_everywhere(course, grid), _apart_where_unsure(course, grid, cost, move_m)):
-        found.append(_cheapest(stage, grid, cost + np.where(allowed, 0.0, _FORBIDDEN)[:, None], move_m))
+    model = _Model.of(stage, station_m[beside], left_m[beside], drive)
+    found = [*model.likely(with_changes=False), *model.likely(with_changes=True)]
+    weak = _unexpected_strength([course for _, course in found], station_m, left_m, passing)
     lanes = sorted(
         (
-            (total + _ONCOMING_COST * _is_oncoming(course, station_m, left_m, named), course)
-            for total, course in found
+            (total + _ONCOMING_COST * _is_oncoming(course, station_m, left_m, named) + weak[k], k, course)
+            for k, (total, course) in enumerate(found)
             if total < _FORBIDDEN and _has_lines(course, station_m, left_m)
         ),
-        key=lambda lane: lane[0],
+        key=lambda lane: lane[:2],
     )
     if not lanes:
         return None
-    (least, course), *rivals = lanes
-    others = [rival for total, rival in rivals if total < least + _TIE and _farthest(course, rival)[1] >= _ANOTHER_M]
-    return DrivenLane(_sides_of(course, station_m, left_m), course, tuple(others))
+    (least, _, course), *rivals = lanes
+    tie = _TIE
+    if course.lane.any() and not model.precise:
+        tie = _COARSE_CHANGE_TIE if model.has_both_lanes(course) else math.inf
+    others = [rival for total, _, rival in rivals if total < least + tie and _farthest(course, rival)[1] >= _ANOTHER_M]
+    last = model.trace(_last_lane_m(course)) if course.lane.any() else course
+    side = _sides_of(last, station_m, left_m)
+    return DrivenLane(side, course, tuple(others), last, tuple(_lanes_beside(model, last, station_m, left_m, named)))
 
 
 def describe_tie(chosen: DrivenLane, drive: DrivenLine) -> str:
@@ -115,14 +185,204 @@ def describe_tie(chosen: DrivenLane, drive: DrivenLine) -> str:
 
 
 def _farthest(course: LaneCourse, other: LaneCourse) -> tuple[int, float]:
-    """The station where two lanes are farthest apart, and how far. [m]"""
+    """The station where two courses, or the lanes at their ends, are farthest apart, and how far. [m]"""
     apart = np.abs(course.centre_m - other.centre_m)
+    apart = np.maximum(apart, np.abs(_last_lane_m(course) - _last_lane_m(other)))
+    apart *= ~(course.changing | other.changing)
     return int(np.argmax(apart)), float(apart.max())
 
 
 def _stages(station_m: Floats) -> Floats:
     first, last = float(station_m.min()), float(station_m.max())
     return np.linspace(first, last, max(math.ceil((last - first) / _STEP_M), 1) + 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Model:
+    """Costs of the states of a course: offset and width of the lane, and what the vehicle does."""
+
+    stage_m: Floats  # shape (B,)
+    grid: Floats  # shape (G,): [m] of the centre, left of the track
+    line: Floats  # shape (B, W, G): cost of markers
+    prior: Floats  # shape (G,): cost of the centre's offset from the vehicle at each station
+    slope: Floats  # shape (B, G): of lines there, to the left of the track; grid steps from the station before
+    sigma_m: float  # [m] of the vehicle's track beside its lane's centre
+    precise: bool  # the receiver is accurate enough to show the lane
+
+    @classmethod
+    def of(cls, stage_m: Floats, station_m: Floats, left_m: Floats, drive: DrivenLine) -> _Model:
+        """The model of a drive."""
+        grid: Floats = np.arange(-_HALF_GRID_M, _HALF_GRID_M + _GRID_M / 2, _GRID_M)
+        accuracy = max(drive.accuracy_m if np.isfinite(drive.accuracy_m) else _UNKNOWN_ACCURACY_M, drive.jump_m)
+        precise = accuracy < TRUSTED_TRACK_M
+        length_m = _PRECISE_LENGTH_M if precise else max(_SLOW_TIME_S * drive.speed_m_s, _PRECISE_LENGTH_M)
+        share, sigma = _STEP_M / length_m, math.hypot(accuracy, _DRIVER_M)
+        line = _line_costs(stage_m, station_m, left_m, grid)
+        prior = np.minimum((grid / sigma) ** 2, _MAX_PRIOR) * share
+        slope = _slopes(stage_m, station_m, left_m, grid) * (stage_m[1] - stage_m[0]) / _GRID_M
+        return cls(stage_m, grid, line, prior, slope, sigma, precise)
+
+    def cheapest(self, allowed: Bools | None = None, *, with_changes: bool = True) -> tuple[float, LaneCourse]:
+        """The cheapest course (Viterbi algorithm), after what it costs; `allowed` offsets have shape (B, G)."""
+        cost = self._costs(allowed, with_changes)
+        total, came = _follow(cost, self.slope, *self._changes(), self._prices())
+        last = int(np.argmin(total[-1]))
+        least = float(total[-1].flat[last])
+        states = [last]
+        for b in range(len(self.stage_m) - 1, 0, -1):
+            states.append(int(came[b].flat[states[-1]]))
+        mode, width, offset = np.unravel_index(states[::-1], total.shape[1:])
+        to_left = (mode[:-1] == _LEFT_BEFORE) & (mode[1:] == _LEFT_AFTER)
+        to_right = (mode[:-1] == _RIGHT_BEFORE) & (mode[1:] == _RIGHT_AFTER)
+        lane = np.concatenate([[0], np.cumsum(to_left.astype(int) - to_right)])
+        return least, LaneCourse(self.stage_m, self.grid[offset], _WIDTHS_M[width], lane - lane[-1], mode)
+
+    def likely(self, *, with_changes: bool) -> list[tuple[float, LaneCourse]]:
+        """The cheapest course, the cheapest of other lanes, and the cheapest one that is elsewhere in one place."""
+        first = self.cheapest(with_changes=with_changes)
+        found = [first]
+        while len(found) <= _MAX_RIVALS:
+            apart = np.all([_apart(course, self.grid) for _, course in found], 0)
+            total, course = self.cheapest(apart, with_changes=with_changes)
+            if total > first[0] + _TIE + _ONCOMING_COST + _MAX_STRENGTH_COST:
+                break
+            found.append((total, course))
+        if (elsewhere := self._unsure(first[1], with_changes)) is not None:
+            found.append(self.cheapest(elsewhere, with_changes=with_changes))
+        return found
+
+    def has_both_lanes(self, course: LaneCourse) -> bool:
+        """Whether the lanes between which the vehicle changes are marked beside each other."""
+        for k in np.flatnonzero(np.diff(course.lane)):
+            apart_m = np.sign(course.lane[k + 1] - course.lane[k]) * (course.width_m[k] + course.width_m[k + 1]) / 2
+            before, after = slice(max(k - _BOTH_LANES, 0), k + 1), slice(k + 1, k + 2 + _BOTH_LANES)
+            new_m, old_m = course.centre_m[before] + apart_m, course.centre_m[after] - apart_m
+            for at, centre_m in ((before, new_m), (after, old_m)):
+                near = np.abs(self.grid - centre_m[:, None]) < _TRACE_M
+                least = np.where(near[:, None], self.line[at], np.inf).min((1, 2))
+                if (least > _NO_LINE_COST).any():
+                    return False
+        return True
+
+    def trace(self, centre_m: Floats) -> LaneCourse:
+        """A lane whose centre is known within a metre, wherever the vehicle is."""
+        near = np.abs(self.grid - centre_m[:, None]) < _TRACE_M
+        return replace(self, prior=np.zeros(len(self.grid))).cheapest(near, with_changes=False)[1]
+
+    def beyond(self, course: LaneCourse, sign: int) -> LaneCourse | None:
+        """The next lane on the left (1) or on the right (-1), where it has markers on both boundaries."""
+        away = sign * (self.grid - course.centre_m[:, None])
+        if not (away > _ANOTHER_M).any(1).all():
+            return None
+        model = replace(self, prior=_NEARER_COST * np.abs(self.grid))
+        _, found = model.cheapest(away > course.width_m[:, None] / 2 + _WIDTHS_M[0] / 2 - _GRID_M, with_changes=False)
+        offset = np.rint((found.centre_m - self.grid[0]) / _GRID_M).astype(int)
+        width = np.rint((found.width_m - _WIDTHS_M[0]) / (_WIDTHS_M[1] - _WIDTHS_M[0])).astype(int)
+        marked = self.line[np.arange(len(offset)), width, offset] < _NO_LINE_COST
+        edges = np.flatnonzero(np.diff(np.r_[0, marked.astype(np.int8), 0]))
+        start, end = max(zip(edges[::2], edges[1::2], strict=True), key=lambda run: run[1] - run[0], default=(0, 0))
+        if end - start < _MIN_STRETCH:
+            return None
+        at = slice(start, end)
+        return LaneCourse(found.station_m[at], found.centre_m[at], found.width_m[at], found.lane[at], found.doing[at])
+
+    def _unsure(self, course: LaneCourse, with_changes: bool) -> Bools | None:
+        """Offsets of courses that are in another lane at the station where that costs least, shape (B, G)."""
+        cost = self._costs(None, with_changes)
+        modes = _REVERSED[: cost.shape[1]]
+        changes, price = self._changes(), self._prices()
+        before, _ = _follow(cost, self.slope, *changes, price)
+        back = -np.vstack([self.slope[:1], self.slope[:0:-1]])
+        after, _ = _follow(np.ascontiguousarray(cost[::-1][:, modes]), back, *changes, price)
+        through = (before + after[::-1][:, modes] - cost).min((1, 2))
+        apart = _apart(course, self.grid) & ~course.changing[:, None]
+        if not apart.any():
+            return None
+        at = int(np.argmin(np.where(apart, through, np.inf).min(1)))
+        return np.asarray(apart | (np.arange(len(apart)) != at)[:, None])
+
+    def _costs(self, allowed: Bools | None, with_changes: bool) -> Floats:
+        """Of all states, shape (B, M, W, G) with M of 5, or 1 without changes of lane."""
+        cost = np.repeat(self.line[:, None], 5 if with_changes else 1, 1)
+        cost[:, _KEEPING] += self.prior
+        outside = np.maximum(np.abs(self.grid) - _WIDTHS_M[:, None] / 2, 0.0)
+        cost[:, 1:] += np.minimum((outside / self.sigma_m) ** 2, _MAX_PRIOR) + _CHANGING_COST
+        if allowed is not None:
+            cost += np.where(allowed, 0.0, _FORBIDDEN)[:, None, None]
+        return cost
+
+    def _prices(self) -> tuple[float, float]:
+        """Of a centre that leaves the direction of the lines, and of one that moves beside the track, by grid step."""
+        return (_GRID_M / _ALONG_LINE_M) ** 2, (_GRID_M / (_MOVE_M if self.precise else _SLOW_MOVE_M)) ** 2
+
+    def _changes(self) -> tuple[Floats, Ints]:
+        """Cost of crossing the left boundary by width and offset, and grid steps between two lanes by their widths."""
+        off = (self.grid + _WIDTHS_M[:, None] / 2) / math.hypot(self.sigma_m, _CROSSING_M)
+        steps = np.rint((_WIDTHS_M[:, None] + _WIDTHS_M) / 2 / _GRID_M).astype(np.int64)
+        return np.minimum(off**2, _MAX_PRIOR), steps
+
+
+@ieee_kernel
+def _follow(
+    cost: Floats, slope: Floats, crossing: Floats, apart: Ints, price: tuple[float, float]
+) -> tuple[Floats, Ints]:
+    """Least cost up to each station and state, and the state before, shape (B, 5, W, G) each."""
+    count, modes, widths, size = cost.shape
+    total, came = cost.copy(), np.zeros(cost.shape, np.int64)
+    moved, source = np.empty((modes, widths, size)), np.empty((modes, widths, size), np.int64)
+    switched, origin = np.empty((modes, widths, size)), np.empty((modes, widths, size), np.int64)
+    if modes > 1:
+        total[0, 1:] += _CHANGE_COST
+    for b in range(1, count):
+        for m in range(modes):
+            most = np.inf if m == _KEEPING else _MAX_CHANGE_MOVE_COST
+            for w in range(widths):
+                for g in range(size):
+                    best, at = np.inf, g
+                    middle = g - round(slope[b, g])
+                    for h in range(max(middle - _MAX_MOVE, 0), min(middle + _MAX_MOVE + 1, size)):
+                        off = g - h - slope[b, g]
+                        value = total[b - 1, m, w, h] + min(price[0] * off * off, most)
+                        if m == _KEEPING:
+                            value += price[1] * (g - h) * (g - h)
+                        if value < best:
+                            best, at = value, h
+                    moved[m, w, g], source[m, w, g] = best, (m * widths + w) * size + at
+        for w in range(widths):
+            for g in range(size):
+                for m in range(modes):
+                    switched[m, w, g], origin[m, w, g] = moved[m, w, g], source[m, w, g]
+                if modes == 1:
+                    continue
+                for m in (_LEFT_AFTER, _RIGHT_AFTER):
+                    if moved[m, w, g] < switched[_KEEPING, w, g]:
+                        switched[_KEEPING, w, g], origin[_KEEPING, w, g] = moved[m, w, g], source[m, w, g]
+                for m in (_LEFT_BEFORE, _RIGHT_BEFORE):
+                    value = moved[_KEEPING, w, g] + _CHANGE_COST
+                    if value < switched[m, w, g]:
+                        switched[m, w, g], origin[m, w, g] = value, source[_KEEPING, w, g]
+        if modes > 1:
+            for sign in (1, -1):
+                old = _LEFT_BEFORE if sign == 1 else _RIGHT_BEFORE
+                for v in range(widths):
+                    for w in range(widths):
+                        step = sign * apart[v, w]
+                        for g in range(max(0, -step), min(size, size - step)):
+                            value = moved[old, v, g] + crossing[v, g if sign == 1 else size - 1 - g]
+                            if value < switched[old + 1, w, g + step]:
+                                switched[old + 1, w, g + step] = value
+                                origin[old + 1, w, g + step] = source[old, v, g]
+        for m in range(modes):
+            for w in range(widths):
+                for g in range(size):
+                    best, at = switched[m, w, g], origin[m, w, g]
+                    for v in range(max(w - 1, 0), min(w + 2, widths)):
+                        value = switched[m, v, g] + (_WIDTH_COST if v != w else 0.0)
+                        if value < best:
+                            best, at = value, origin[m, v, g]
+                    total[b, m, w, g] += best
+                    came[b, m, w, g] = at
+    return total, came
 
 
 def _line_costs(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats) -> Floats:
@@ -136,7 +396,7 @@ def _line_costs(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats
         near = np.flatnonzero(along[b] < _LINE_REACH_M)
         if len(near):
             off = (left_m[near, None] - fine) / sigma[b, near, None]
-            line[b] = np.minimum((off**2 + (along[b, near, None] / _LINE_REACH_M) ** 2).min(0), _NO_LINE_COST)
+            line[b] = np.minimum((off**2 + (2 * along[b, near, None] / _LINE_REACH_M) ** 2).min(0), _NO_LINE_COST)
         here = left_m[along[b] < _WITHIN_REACH_M]
         within[b] = np.searchsorted(np.sort(here), fine)
     out = np.empty((len(stage_m), len(_WIDTHS_M), len(grid)))
@@ -149,54 +409,107 @@ def _line_costs(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats
     return out
 
 
-def _cheapest(stage_m: Floats, grid: Floats, cost: Floats, move_m: float) -> tuple[float, LaneCourse]:
-    """The cheapest course (Viterbi algorithm), after what it costs."""
-    total, came = _forward(cost, move_m)
-    states = [int(np.argmin(total[-1]))]
-    for b in range(len(stage_m) - 1, 0, -1):
-        states.append(int(came[b].flat[states[-1]]))
-    width, offset = np.unravel_index(states[::-1], total.shape[1:])
-    return float(total[-1].min()), LaneCourse(stage_m, grid[offset], _WIDTHS_M[width])
+def _slopes(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats) -> Floats:
+    """Direction of the lines beside the track at each station, shape (B, G); 0 where markers show none.
+
+    It is the one in which most pairs of neighbouring markers lie. A vehicle that changes lane crosses the lines.
+    """
+    tried: Floats = np.arange(-_MAX_SLOPE, _MAX_SLOPE + _SLOPE_STEP / 2, _SLOPE_STEP)
+    coarse: Floats = np.linspace(grid[0], grid[-1], 9)
+    out = np.zeros((len(stage_m), len(grid)))
+    order = np.argsort(station_m)
+    ranked, left = station_m[order], left_m[order]
+    ends = np.searchsorted(ranked, ranked + _PAIR_M[1], side="right")
+    first = np.repeat(np.arange(len(ranked)), ends - np.arange(len(ranked)))
+    second = np.concatenate([np.arange(k, end) for k, end in enumerate(ends)])
+    apart = ranked[second] - ranked[first]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = (left[second] - left[first]) / apart
+    kept = (apart > _PAIR_M[0]) & (np.abs(slope) <= _MAX_SLOPE) & (np.abs(left[second] - left[first]) < _PAIR_ACROSS_M)
+    middle_m, across, slope = ((ranked[second] + ranked[first]) / 2)[kept], left[first][kept], slope[kept]
+    agree = np.exp(-(((slope[:, None] - tried) / (2.5 * _SLOPE_STEP)) ** 2) / 2)
+    for b, at in enumerate(stage_m):
+        near = np.abs(middle_m - at + (stage_m[1] - stage_m[0]) / 2) < _SLOPE_REACH_M / 2
+        here = across[near] + slope[near] * (at - middle_m[near])
+        weight = np.exp(-(((here - coarse[:, None]) / _SLOPE_ACROSS_M) ** 2) / 2) @ agree[near]
+        best = tried[np.argmax(weight, 1)] * (weight.max(1) >= _MIN_PAIRS)
+        out[b] = np.interp(grid, coarse, best)
+    return out
 
 
-def _forward(cost: Floats, move_m: float) -> tuple[Floats, Ints]:
-    """Least cost up to each station and state, and the state before, shape (B, W, G) each."""
-    count, widths, size = cost.shape
-    total, came = cost.copy(), np.zeros(cost.shape, np.int64)
-    index = np.arange(widths * size).reshape(widths, size)
-    for b in range(1, count):
-        best, source = total[b - 1].copy(), index.copy()
-        for step in range(1, _MAX_MOVE + 1):
-            price = (step * _GRID_M / move_m) ** 2
-            for to, of in ((np.s_[:, step:], np.s_[:, :-step]), (np.s_[:, :-step], np.s_[:, step:])):
-                tried = total[b - 1][of] + price
-                better = tried < best[to]
-                best[to] = np.where(better, tried, best[to])
-                source[to] = np.where(better, index[of], source[to])
-        moved, moved_from = best.copy(), source.copy()
-        for to_width, of_width in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
-            tried = best[of_width] + _WIDTH_COST
-            better = tried < moved[to_width]
-            moved[to_width] = np.where(better, tried, moved[to_width])
-            moved_from[to_width] = np.where(better, source[of_width], moved_from[to_width])
-        total[b] += moved
-        came[b] = moved_from
-    return total, came
-
-
-def _apart_everywhere(course: LaneCourse, grid: Floats) -> Bools:
+def _apart(course: LaneCourse, grid: Floats) -> Bools:
     """States of other lanes, shape (B, G)."""
     return np.asarray(np.abs(grid - course.centre_m[:, None]) >= _ANOTHER_M)
 
 
-def _apart_where_unsure(course: LaneCourse, grid: Floats, cost: Floats, move_m: float) -> Bools:
-    """States of courses that are in another lane at the station where that costs least, shape (B, G)."""
-    before, _ = _forward(cost, move_m)
-    after, _ = _forward(cost[::-1], move_m)
-    through = (before + after[::-1] - cost).min(1)
-    apart = _apart_everywhere(course, grid)
-    unsure = int(np.argmin(np.where(apart, through, np.inf).min(1)))
-    return np.asarray(apart | (np.arange(len(apart)) != unsure)[:, None])
+def _unexpected_strength(courses: list[LaneCourse], station_m: Floats, left_m: Floats, passing: Passing) -> list[float]:
+    """How badly each lane explains the strength of markers that were passed, in squared sigmas.
+
+    Strength falls with the logarithm of distance, and differs between the sides of the vehicle. Its level, slope and
+    difference are fitted for each lane; a marker counts once, however often it was received.
+    """
+    misfit_db2, count = [], 0.0
+    for course in courses:
+        at = station_m[passing.row] - passing.along_m
+        across = left_m[passing.row] - np.interp(at, course.station_m, course.vehicle_m)
+        near = np.abs(passing.along_m) < _PASSING_M
+        if near.sum() < _MIN_PASSING:
+            return [0.0] * len(courses)
+        row, along, side = passing.row[near], passing.along_m[near], np.sign(across[near])
+        fallen_db = 10 * np.log10(np.sqrt(along**2 + across[near] ** 2 + _ANTENNA_M**2))
+        weight = np.sqrt(1 / np.bincount(row)[row])
+        count = float((weight**2).sum())
+        terms = np.stack([np.ones(len(row)), -fallen_db, side], 1)
+        known = np.array([0.0, _EXPONENT, 0.0]), np.array([_LEVEL_SD_DB, _EXPONENT_SD, _SIDES_SD_DB])
+        matrix = np.vstack([terms * weight[:, None], np.diag(_STRENGTH_SD_DB / known[1])])
+        right = np.concatenate([passing.rssi_dbm[near] * weight, known[0] * _STRENGTH_SD_DB / known[1]])
+        fitted = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        misfit_db2.append(float(((matrix @ fitted - right) ** 2).sum()))
+    sd_db2 = max(min(misfit_db2) / count, _STRENGTH_SD_DB**2)
+    return [min((one - min(misfit_db2)) / sd_db2, _MAX_STRENGTH_COST) for one in misfit_db2]
+
+
+def _last_lane_m(course: LaneCourse) -> Floats:
+    """Centre of the lane in which the vehicle is at the end, left of the track, shape (B,). [m]"""
+    crossed = np.flatnonzero(np.diff(course.lane))
+    centre = course.centre_m.copy()
+    for k in crossed:
+        to_left = np.sign(course.lane[k + 1] - course.lane[k])
+        centre[: k + 1] += to_left * (course.width_m[k] + course.width_m[k + 1]) / 2
+    return centre
+
+
+def _lanes_beside(
+    model: _Model, last: LaneCourse, station_m: Floats, left_m: Floats, named: Ints
+) -> list[CourseBeside]:
+    """Other lanes, the nearest first on each side."""
+    found = []
+    for sign in (1, -1):
+        course: LaneCourse | None = last
+        for position in range(1, _MAX_BESIDE + 1):
+            if course is None or len(course.station_m) < len(last.station_m):
+                break
+            course = model.beyond(course, sign)
+            if course is None or not _has_lines(course, station_m, left_m):
+                break
+            side = _sides_of(course, station_m, left_m)
+            inside = (station_m > course.station_m[0] - _STEP_M) & (station_m < course.station_m[-1] + _STEP_M)
+            side = np.where(inside, side, UNKNOWN)
+            found.append(CourseBeside(sign * position, _direction(side, named), course, side))
+    return found
+
+
+def _direction(side: Ints, named: Ints) -> bool | None:
+    """Whether a lane is an oncoming one by the sides that its markers send; None where they do not show it."""
+    differ = []
+    for which in (LEFT, RIGHT):
+        sent = named[(side == which) & (named != UNKNOWN)]
+        differ.append(float(np.mean(sent != which)) if len(sent) else math.nan)
+    if np.isnan(differ).any():
+        return None
+    if min(differ) >= _ONCOMING_SHARE:
+        return True
+    return False if max(differ) <= 1 - _ONCOMING_SHARE else None
 
 
 def _off_boundaries(course: LaneCourse, station_m: Floats, left_m: Floats) -> tuple[Floats, Floats]:
@@ -215,12 +528,7 @@ def _sides_of(course: LaneCourse, station_m: Floats, left_m: Floats) -> Ints:
 
 def _is_oncoming(course: LaneCourse, station_m: Floats, left_m: Floats, named: Ints) -> bool:
     """Whether the markers on both boundaries send the other side."""
-    side = _sides_of(course, station_m, left_m)
-    for which in (LEFT, RIGHT):
-        sent = named[(side == which) & (named != UNKNOWN)]
-        if not len(sent) or np.mean(sent != which) < _ONCOMING_SHARE:
-            return False
-    return True
+    return _direction(_sides_of(course, station_m, left_m), named) is True
 
 
 def _has_lines(course: LaneCourse, station_m: Floats, left_m: Floats) -> bool:

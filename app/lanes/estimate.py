@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Literal
 
@@ -10,7 +11,14 @@ import scipy
 
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
-from app.lanes.driven_lane import choose_driven_lane, describe_tie
+from app.lanes.driven_lane import (
+    NOTHING_PASSED,
+    CourseBeside,
+    LaneCourse,
+    Passing,
+    choose_driven_lane,
+    describe_tie,
+)
 from app.lanes.initial_line import (
     TRUSTED_TRACK_M,
     DrivenLine,
@@ -20,10 +28,30 @@ from app.lanes.initial_line import (
     largest_group,
 )
 from app.lanes.lane_fit import LaneFit
-from app.lanes.lane_path import compare_with_track, path_from_fit, path_from_splines, refused_path, runs_apart
+from app.lanes.lane_path import (
+    compare_with_track,
+    largest_departure,
+    path_from_fit,
+    path_from_splines,
+    refused_path,
+    runs_apart,
+)
 from app.lanes.observations import LaneObservations, distinct_places, observations_from_markers
 from app.lanes.smooth_line import SmoothLine, boundaries_by_splines, plane_from_wgs84
-from app.lanes.types import LEFT, RIGHT, UNKNOWN, Lane, LaneMarkers, LaneRules, LeftOut, LeftOutReason, Notes
+from app.lanes.types import (
+    LEFT,
+    RIGHT,
+    UNKNOWN,
+    Lane,
+    LaneBeside,
+    LaneMarkers,
+    LaneRules,
+    LaneStretch,
+    LeftOut,
+    LeftOutReason,
+    Notes,
+    PacketStrengths,
+)
 from app.sensors.pose_track import PoseTrack
 from app.values import Bools, Floats, Ints
 
@@ -39,6 +67,14 @@ _NOT_ALONG = (
     "markers of several lanes were received, and the vehicle's track runs along none of them: the vehicle changes "
     "lane, or its receiver is less accurate than it states"
 )
+_MIN_DEPARTURE_M, _DEPARTURE_SHARE = 0.4, 0.5  # [m, 1] of a path from a track's shape; share of its stated accuracy
+_UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none
+_STILL_CHANGING = (
+    "the vehicle changes lane until the end of the log, so that nothing shows in which lane it is: send a longer log"
+)
+_MIN_FIXES = 10  # of the track in the lane to which the vehicle changed
+_PASSED_M = 45.0  # [m] from the vehicle; packets of farther markers do not show its lane
+_MAX_GAP_M = 25.0  # [m] without a marker of the driven lane, beside markers of others; two spacings
 _MAX_ACROSS_M = 1.6  # [m] that an accurate track moves across its lane; half of a lane
 _MAX_WITHIN = 2  # markers between the boundaries of a path: of a road that crosses, or spoofed
 _WITHIN_MARGIN_M = 0.6  # [m] from a boundary; `LaneDeclaration.off_the_line_m`
@@ -54,6 +90,7 @@ def fit_lane(
     *,
     method: Literal["waymark", "paper"] = "waymark",
     rules: LaneRules | None = None,
+    strengths: PacketStrengths | None = None,
 ) -> Lane:
     """Fit the reference path of a lane to its markers.
 
@@ -65,6 +102,8 @@ def fit_lane(
         The vehicle's own positions: give the direction of travel and the approximate shape of the lane, not its place.
     method : {'waymark', 'paper'}
         'paper' is section 2.2 of the CERPM paper: a cubic spline a side, and midpoints.
+    strengths : PacketStrengths, optional
+        Of the markers' packets: of several lanes, they help to show which one the vehicle drives.
 
     Returns
     -------
@@ -88,14 +127,20 @@ def fit_lane(
     line, taken = _initial_line(observations, taken, drive, rules, notes)
     if method == "paper":
         return _fit_by_splines(observations, taken, line, notes)
-    lane = _fit_by_least_squares(observations, taken, line, drive, rules, notes)
+    if line is None:
+        reason = "the markers do not lie along a lane, or are one row without a known side"
+        return refused_path(observations, notes, reason, "waymark")
+    alone = notes.copy()
+    lane = _fit_by_least_squares(observations, taken, line, drive, rules, alone)
+    if lane is None and drive is not None:
+        heard = _passing(strengths, track, observations, taken, drive)
+        lane = _fit_driven_lane(observations, taken, drive, heard, rules, notes)
+    if lane is None:
+        reason = f"the markers share no line: {len(alone.left_out) - len(notes.left_out)} of them lie off it"
+        return refused_path(observations, alone, reason, "waymark")
     if track is None:
         return lane
-    agreement = compare_with_track(lane, track)
-    if agreement is None and drive is not None and lane.refusal is None and runs_apart(lane, track):
-        warnings = (*lane.localization_warnings, _TRACK_APART)
-        return replace(lane, track_apart=True, localization_warnings=warnings)
-    return replace(lane, track_agreement=agreement)
+    return _compared_with_track(lane, _track_in_lane(lane, track), drive)
 
 
 def preview_m(lane: Lane, lon_deg: float, lat_deg: float) -> float:
@@ -163,18 +208,16 @@ def _connected_markers(observations: LaneObservations, taken: Bools, rules: Lane
 def _fit_by_least_squares(
     observations: LaneObservations,
     taken: Bools,
-    line: SmoothLine | None,
+    line: SmoothLine,
     drive: DrivenLine | None,
     rules: LaneRules,
     notes: Notes,
-) -> Lane:
-    """Waymark's method, with all reasons to refuse a lane."""
+) -> Lane | None:
+    """Waymark's method, with reasons to refuse a lane; None where the markers share no line."""
 
     def refused(reason: str) -> Lane:
         return refused_path(observations, notes, reason, "waymark")
 
-    if line is None:
-        return refused("the markers do not lie along a lane, or are one row without a known side")
     fit = LaneFit(line, observations, taken, drive, rules, notes)
     try:
         found = fit.run()
@@ -185,12 +228,10 @@ def _fit_by_least_squares(
             found = fit.run()
     except np.linalg.LinAlgError:  # weights too different for float64
         return refused("the accuracies of markers and track are too different to be combined")
-    if not found and drive is not None and (lane := _fit_driven_lane(observations, taken, drive, rules, notes)):
-        return lane
     for k, (reason, off) in fit.left_out.items():
         notes.left_out.append(LeftOut(int(observations.row[k]), int(observations.number[k]), reason, off))
     if not found:
-        return refused(f"the markers share no line: {len(fit.left_out)} of them lie off it")
+        return None
     if _is_row_of_unknown_side(fit, observations, taken, drive):
         return refused("one row of markers, and nothing shows on which side of the lane it is")
     _warn_of_guessed_sides(fit, observations, drive, notes)
@@ -200,29 +241,165 @@ def _fit_by_least_squares(
     return lane
 
 
+def _compared_with_track(lane: Lane, track: PoseTrack, drive: DrivenLine | None) -> Lane:
+    """A lane with its agreement with the track, and with warnings where the path is elsewhere or has another shape."""
+    agreement = compare_with_track(lane, track)
+    if agreement is None:
+        if drive is None or lane.refusal is not None or not runs_apart(lane, track):
+            return lane
+        warnings = (*lane.localization_warnings, _TRACK_APART)
+        return replace(lane, track_apart=True, localization_warnings=warnings)
+    departure = largest_departure(lane, track)
+    stated = track.accuracy_m[np.isfinite(track.accuracy_m)]
+    accuracy_m = float(np.median(stated)) if len(stated) else _UNKNOWN_ACCURACY_M
+    if departure is not None and departure.rms_m > max(_MIN_DEPARTURE_M, _DEPARTURE_SHARE * accuracy_m):
+        warning = (
+            f"{departure.station_m:.0f} m along it the path turns aside where the vehicle does not, by "
+            f"{departure.rms_m:.1f} m: check the datum and the survey of the markers there"
+        )
+        warnings = (*lane.localization_warnings, warning)
+        return replace(lane, track_agreement=agreement, track_apart=True, localization_warnings=warnings)
+    return replace(lane, track_agreement=agreement)
+
+
+# --- the driven one of several lanes ------------------------------------------------------------------------------
+
+
+def _passing(
+    strengths: PacketStrengths | None,
+    track: PoseTrack | None,
+    observations: LaneObservations,
+    taken: Bools,
+    drive: DrivenLine,
+) -> Passing:
+    """Packets of markers that the vehicle passed; rows count the taken markers."""
+    if strengths is None or track is None or not len(track.time_s):
+        return NOTHING_PASSED
+    number = observations.number[taken]
+    order = np.argsort(number)
+    row = order[np.searchsorted(number[order], strengths.number).clip(0, len(order) - 1)]
+    inside = (strengths.time_s >= track.time_s[0]) & (strengths.time_s <= track.time_s[-1])
+    good = inside & (number[row] == strengths.number) & np.isfinite(strengths.rssi_dbm)
+    row, time_s, rssi_dbm = row[good], strengths.time_s[good], strengths.rssi_dbm[good]
+    fixes = plane_from_wgs84(track.lon_deg, track.lat_deg, observations.origin)
+    here = np.stack([np.interp(time_s, track.time_s, fixes[:, axis]) for axis in range(2)], 1)
+    point = observations.point_m[taken][row]
+    near = np.hypot(*(here - point).T) < _PASSED_M
+    if not near.any():
+        return NOTHING_PASSED
+    vehicle, _ = drive.line.project(here[near])
+    marker, _ = drive.line.refine_stations(point[near], vehicle.copy())
+    return Passing(row[near], marker - vehicle, rssi_dbm[near])
+
+
 def _fit_driven_lane(
-    observations: LaneObservations, taken: Bools, drive: DrivenLine, rules: LaneRules, notes: Notes
+    observations: LaneObservations,
+    taken: Bools,
+    drive: DrivenLine,
+    heard: Passing,
+    rules: LaneRules,
+    notes: Notes,
 ) -> Lane | None:
     """Fit the driven one of several lanes, or refuse it; None where the markers are of no more than one lane."""
     half = rules.usual_width_m / 2
     station, left = drive.line.project_markers(observations.point_m, observations.side, half)
-    chosen = choose_driven_lane(station[taken], left[taken], observations.side[taken], drive)
+    chosen = choose_driven_lane(station[taken], left[taken], observations.side[taken], drive, heard)
     if chosen is None or (chosen.side != UNKNOWN).all():
         return None
     if chosen.others:
         return refused_path(observations, notes, describe_tie(chosen, drive), "waymark")
-    if drive.accuracy_m < TRUSTED_TRACK_M and np.ptp(chosen.course.centre_m) > _MAX_ACROSS_M:
+    course = chosen.course
+    if drive.accuracy_m < TRUSTED_TRACK_M and _across_m(course) > _MAX_ACROSS_M:
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
+    line, stays = drive.line, drive
+    if course.lane.any():
+        line = _line_beside(drive, chosen.last)
+        since_m = float(course.station_m[np.flatnonzero((course.lane != 0) | course.changing)[-1]])
+        stays = replace(drive, line=line, fix_m=drive.fix_m[drive.line.project(drive.fix_m)[0] > since_m])
+        if len(stays.fix_m) < _MIN_FIXES:
+            return refused_path(observations, notes, _STILL_CHANGING, "waymark")
     side = np.zeros(len(taken), np.int64)
     side[taken] = chosen.side
     sided = replace(observations, side=side)
-    lane = _fit_own_markers(sided, taken, side != UNKNOWN, drive, rules, notes)
+    lane = _fit_own_markers(sided, taken, side != UNKNOWN, line, stays, rules, notes)
+    if lane is None or lane.refusal is not None:
+        return lane
     inner = (side != UNKNOWN) & ~_of_outer_rows(lane, sided)
-    if lane.refusal is None and inner.sum() < (side != UNKNOWN).sum():
-        lane = _fit_own_markers(sided, taken, inner, drive, rules, notes)
-    if lane.refusal is None and _markers_within(lane, observations.point_m[taken], half) > _MAX_WITHIN:
+    if inner.sum() < (side != UNKNOWN).sum():
+        lane = _fit_own_markers(sided, taken, inner, line, stays, rules, notes)
+        if lane is None or lane.refusal is not None:
+            return lane
+    if _markers_within(lane, observations.point_m[taken], half) > _MAX_WITHIN:
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
-    return lane
+    if not drive.accuracy_m < TRUSTED_TRACK_M and _widest_gap_m(lane, observations) > _MAX_GAP_M:
+        return refused_path(observations, notes, _NOT_ALONG, "waymark")
+    stretches = _stretches(lane, course, drive) if course.lane.any() else ()
+    beside = tuple(
+        found
+        for other in chosen.beside
+        if (found := _fit_lane_beside(observations, taken, other, drive, rules)) is not None
+    )
+    return replace(lane, stretches=stretches, beside=beside)
+
+
+def _across_m(course: LaneCourse) -> float:
+    """How far a lane's centre moves beside the track, but for changes of lane. [m]"""
+    return float(np.ptp(course.centre_m[~course.changing])) if not course.changing.all() else 0.0
+
+
+def _line_beside(drive: DrivenLine, course: LaneCourse) -> SmoothLine:
+    """The line of a course beside the track, where its markers are."""
+    station = np.linspace(course.station_m[0], course.station_m[-1], 4 * len(course.station_m))
+    return SmoothLine(drive.line.offset_points(station, np.interp(station, course.station_m, course.centre_m)))
+
+
+def _fit_lane_beside(
+    observations: LaneObservations, taken: Bools, other: CourseBeside, drive: DrivenLine, rules: LaneRules
+) -> LaneBeside | None:
+    """The path of another lane; None where its markers do not show one."""
+    side = np.zeros(len(taken), np.int64)
+    side[taken] = other.side
+    line = _line_beside(drive, other.course)
+    if other.oncoming:
+        line = SmoothLine(line.points_m[::-1])
+        side = np.where(side == LEFT, RIGHT, np.where(side == RIGHT, LEFT, UNKNOWN))
+    lane = _fit_by_least_squares(replace(observations, side=side), side != UNKNOWN, line, None, rules, Notes())
+    if lane is None or lane.refusal is not None:
+        return None
+    direction: dict[bool | None, Literal["same", "oncoming", "unknown"]] = {True: "oncoming", False: "same"}
+    return LaneBeside(other.position, direction.get(other.oncoming, "unknown"), lane)
+
+
+def _widest_gap_m(lane: Lane, observations: LaneObservations) -> float:
+    """The longest stretch of a path without a marker of its own, where only the vehicle's track shows it. [m]"""
+    known = observations.of_row >= 0
+    used = observations.point_m[observations.of_row[known & (lane.side != UNKNOWN)]]
+    at = lane.station_m[np.asarray(scipy.spatial.cKDTree(lane.position_enu_m).query(used)[1])]
+    return float(np.diff(np.sort(at)).max(initial=0.0))
+
+
+def _stretches(lane: Lane, course: LaneCourse, drive: DrivenLine) -> tuple[LaneStretch, ...]:
+    """In which lane the vehicle was along the path."""
+    at, _ = drive.line.project(lane.position_enu_m)
+    which = np.rint(np.interp(at, course.station_m, np.arange(len(course.station_m)))).astype(int)
+    state = np.stack([course.lane[which], course.changing[which]], 1)
+    edges = [0, *(np.flatnonzero((np.diff(state, axis=0) != 0).any(1)) + 1).tolist(), len(which) - 1]
+    return tuple(
+        LaneStretch(float(lane.station_m[a]), float(lane.station_m[b]), int(state[a, 0]), bool(state[a, 1]))
+        for a, b in itertools.pairwise(edges)
+    )
+
+
+def _track_in_lane(lane: Lane, track: PoseTrack) -> PoseTrack:
+    """The part of a track on which the vehicle was in the path's lane."""
+    if not lane.stretches:
+        return track
+    since_m = max((part.to_m for part in lane.stretches if part.lane or part.changing), default=0.0)
+    fixes = plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
+    nearest = np.asarray(scipy.spatial.cKDTree(lane.position_enu_m).query(fixes)[1])
+    first = int(np.flatnonzero(lane.station_m[nearest] <= since_m)[-1:].sum())
+    columns = (track.time_s, track.lon_deg, track.lat_deg, track.heading_deg, track.accuracy_m)
+    return PoseTrack(*(column[first:] for column in columns))
 
 
 def _markers_within(lane: Lane, point_m: Floats, half_width_m: float) -> int:
@@ -233,14 +410,20 @@ def _markers_within(lane: Lane, point_m: Floats, half_width_m: float) -> int:
 
 
 def _fit_own_markers(
-    observations: LaneObservations, taken: Bools, own: Bools, drive: DrivenLine, rules: LaneRules, notes: Notes
-) -> Lane:
+    observations: LaneObservations,
+    taken: Bools,
+    own: Bools,
+    line: SmoothLine,
+    drive: DrivenLine,
+    rules: LaneRules,
+    notes: Notes,
+) -> Lane | None:
     """Fit the driven lane to its own markers; the others are left out as another lane's."""
     noted = notes.copy()
     for k in np.flatnonzero(taken & ~own):
         row, number = int(observations.row[k]), int(observations.number[k])
         noted.left_out.append(LeftOut(row, number, LeftOutReason.OTHER_LANE, float("nan")))
-    return _fit_by_least_squares(observations, own, drive.line, drive, rules, noted)
+    return _fit_by_least_squares(observations, own, line, drive, rules, noted)
 
 
 def _of_outer_rows(lane: Lane, observations: LaneObservations) -> Bools:

@@ -414,3 +414,53 @@ def _joint_significance(values: Floats, covariance: Floats) -> float:
     squared = float(values @ np.linalg.solve(covariance, values))
     log_chance = -squared / 2 + math.log1p(squared / 2)
     return float(-scipy.special.ndtri_exp(log_chance - math.log(2.0)))
+
+
+# === Whether a path turns aside where the vehicle drives on.
+#
+# Within a few tens of metres neither a driver nor a receiver's slow error moves far across the lane. Where the path
+# does, markers of one stretch are surveyed in another datum, or the path cuts a corner because true markers were left
+# out. What a constant error of the receiver explains, in its own direction, is no departure.
+
+
+_WINDOW_M = 36.0  # [m] three spacings of the paper
+_MIN_IN_WINDOW = 8  # steps of the track
+_SLOW_ERROR_M = 10.0  # [m] of a receiver, on each axis; it is the same within a window
+
+
+class Departure(NamedTuple):
+    """Where a path departs most from the vehicle's track, but for a constant error of the receiver."""
+
+    station_m: float  # [m] of the path
+    rms_m: float  # [m] within a window, across the path
+
+
+def largest_departure(lane: Lane, track: PoseTrack) -> Departure | None:
+    """How far a path departs from the shape of the vehicle's track; None where too little of it is beside the path."""
+    if not len(lane.station_m) or np.isnan(lane.curvature_per_m).any() or (np.abs(track.lat_deg) > 90).any():
+        return None
+    fixes, spacing_m = _thinned(
+        plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
+    )
+    if len(fixes) < 2:
+        return None
+    far, index = (np.asarray(found) for found in scipy.spatial.cKDTree(lane.position_enu_m).query(fixes))
+    keep = (index > 0) & (index < len(lane.station_m) - 1) & (far < _MAX_BESIDE_M)
+    at, fixes = index[keep], fixes[keep]
+    width = round(_WINDOW_M / spacing_m)
+    if len(at) < max(width, _MIN_IN_WINDOW):
+        return None
+    yaw = np.radians(90.0 - lane.heading_deg[at])
+    normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
+    off = np.sum(normal * (fixes - lane.position_enu_m[at]), 1)
+
+    def windows(values: Floats) -> Floats:
+        total = np.cumsum(np.concatenate([np.zeros((1, *values.shape[1:])), values]), axis=0)
+        return np.asarray(total[width:] - total[:-width])
+
+    squares = windows(normal[:, :, None] * normal[:, None, :]) + np.eye(2) / _SLOW_ERROR_M**2
+    mixed = windows(normal * off[:, None])
+    explained = np.einsum("wi,wi->w", mixed, np.linalg.solve(squares, mixed[:, :, None])[:, :, 0])
+    rms = np.sqrt(np.maximum(windows(off**2) - explained, 0.0) / width)
+    worst = int(np.argmax(rms))
+    return Departure(float(lane.station_m[at[worst + width // 2]]), float(rms[worst]))

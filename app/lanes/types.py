@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -111,6 +111,14 @@ class LaneRules(LaneDeclaration):
     tolerance_m: Positive = 0.25  # [m] source: the definition of confidence (docs/nomenclature.md)
 
 
+class PacketStrengths(NamedTuple):
+    """How strongly packets of markers were received, each of shape (P,)."""
+
+    number: Ints
+    time_s: Floats  # [s] on the clock of the vehicle's track
+    rssi_dbm: Floats
+
+
 class LeftOutReason(StrEnum):
     """Why a marker was not used for the path."""
 
@@ -174,6 +182,26 @@ class TrackAgreement:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class LaneStretch:
+    """A stretch of the path, and the lane in which the vehicle was beside it."""
+
+    # `from_m`, `to_m`: [m] stations of the path
+    from_m: float
+    to_m: float
+    lane: int  # lanes to the left of the path's: 0 in it, 1 in the next lane on the left, -1 in the next on the right
+    changing: bool  # the vehicle changed lane there
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaneBeside:
+    """Another lane whose markers were received."""
+
+    position: int  # lanes to the left of the path's: 1 for the next one on the left, -1 for the next on the right
+    direction: Literal["same", "oncoming", "unknown"]  # of travel, as the sides that its markers send show it
+    lane: Lane  # in its direction of travel, where that is known
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
     """The reference path of a lane, at stations in the direction of travel; without stations if it was refused."""
@@ -206,6 +234,8 @@ class Lane:
     track_agreement: TrackAgreement | None = None  # with the vehicle's track; None without a track beside the path
     # the vehicle's track was used, but does not run beside the path: the path may be anywhere
     track_apart: bool = False
+    stretches: tuple[LaneStretch, ...] = ()  # in which lane the vehicle was; none where it stayed in the path's
+    beside: tuple[LaneBeside, ...] = ()  # other lanes, the nearest first on each side
 
     @property
     def of_other_lanes(self) -> frozenset[int]:

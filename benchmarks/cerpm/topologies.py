@@ -27,6 +27,7 @@ _MAX_CURVATURE_PER_M = 0.01  # [1/m] so that four lanes beside each other do not
 _ORIGIN = (-83.7, 42.3, 250.0)
 _TAPER_M = 120.0  # [m] over which a ramp comes beside a lane; a merging taper at 50 km/h
 _AWAY_M = 12.0  # [m] of a ramp from its lane where it begins
+_CHANGE_M = (40.0, 110.0)  # [m] of a change of lane: 3 to 8 s at 50 km/h
 _ROW_M = 0.15  # [m] between the two rows of a double line
 
 
@@ -34,9 +35,10 @@ _ROW_M = 0.15  # [m] between the two rows of a double line
 class Topology:
     """A road: the lane that is driven, and all markers that are installed, by lane."""
 
-    lane: TrueLane
+    lane: TrueLane  # that is driven; of a vehicle that changes lane, the last one
     installed: InstalledMarkers  # of all lanes; chainages are along their own lanes
     own: frozenset[int]  # numbers of markers on the boundaries of the driven lane
+    course: TrueLane  # between its boundaries the vehicle drives: the lane, but where it changes lane
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +94,7 @@ def _topology(driven: TrueLane, parts: list[InstalledMarkers]) -> Topology:
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     installed = replace(parts[0], **arrays)
     beside = np.minimum(_nearest_m(installed.point_m, driven.left_m), _nearest_m(installed.point_m, driven.right_m))
-    return Topology(driven, installed, frozenset(installed.number[beside < _ROW_M / 2].tolist()))
+    return Topology(driven, installed, frozenset(installed.number[beside < _ROW_M / 2].tolist()), driven)
 
 
 def _nearest_m(points_m: Floats, line_m: Floats) -> Floats:
@@ -108,6 +110,25 @@ def _beside(rng: np.random.Generator, count: int, shared: bool) -> Topology:
     which = int(rng.integers(count))
     rows = [(lane, True, k == 0 or not shared) for k, lane in enumerate(lanes)]
     return _build(lanes[which], rows, rng)
+
+
+def _changing(rng: np.random.Generator, count: int, shared: bool, back: bool) -> Topology:
+    """Lanes of one direction, and a vehicle that changes to another one, or to it and back."""
+    base, width = _base(rng), float(rng.uniform(3.0, 3.7))
+    edges = [(k - count / 2) * width for k in range(count + 1)]
+    gap = 0.0 if shared else _ROW_M / 2
+    lanes = [_lane(_offset(base, edges[k + 1] - gap), _offset(base, edges[k] + gap)) for k in range(count)]
+    first = int(rng.integers(count))
+    other = first + int(rng.choice([step for step in (-1, 1) if 0 <= first + step < count]))
+    over_m, starts_m = rng.uniform(*_CHANGE_M, 2), [float(rng.uniform(130.0, 190.0)), float(rng.uniform(310.0, 350.0))]
+    stays = [first, other, first] if back else [first, other]
+    centre = np.full(len(base.chainage_m), edges[first] + width / 2)
+    for k, (start, after) in enumerate(zip(starts_m, stays[1:], strict=False)):
+        share = np.clip((base.chainage_m - start) / over_m[k], 0.0, 1.0)
+        centre += (after - stays[k]) * width * (share - np.sin(2 * np.pi * share) / (2 * np.pi))
+    course = _lane(_offset(base, centre + width / 2), _offset(base, centre - width / 2))
+    rows = [(lane, True, k == 0 or not shared) for k, lane in enumerate(lanes)]
+    return replace(_build(lanes[stays[-1]], rows, rng), course=course)
 
 
 def _oncoming(rng: np.random.Generator) -> Topology:
@@ -222,4 +243,6 @@ TOPOLOGIES: dict[str, Callable[[np.random.Generator], Topology]] = {
     "frontage road": _frontage,
     "roundabout": _roundabout,
     "U-turn": _u_turn,
+    "lane change": lambda rng: _changing(rng, int(rng.integers(2, 4)), bool(rng.random() < 0.5), back=False),
+    "overtaking": lambda rng: _changing(rng, int(rng.integers(2, 4)), bool(rng.random() < 0.5), back=True),
 }

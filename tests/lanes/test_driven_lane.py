@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scipy
 
 from app.lanes.estimate import fit_lane
-from app.lanes.types import LaneMarkers, LeftOutReason
+from app.lanes.types import LaneMarkers, LeftOutReason, PacketStrengths
 from app.plots.lane import picture_of_lane, plot_lane
-from app.simulation.radio.drive import Multipath, SatelliteReceiver
+from app.simulation.radio.drive import Multipath, SatelliteReceiver, drive_past
 from benchmarks.cerpm.path_errors import place_errors
 from benchmarks.cerpm.scenes import markers_for_lane, track
 from benchmarks.cerpm.topologies import TOPOLOGIES, make_topology
@@ -18,7 +23,7 @@ from benchmarks.cerpm.topologies import TOPOLOGIES, make_topology
 def test_the_driven_lane_is_found_with_rtk(name: str) -> None:
     rng = np.random.default_rng([71, list(TOPOLOGIES).index(name)])
     road = make_topology(name, rng)
-    lane = fit_lane(markers_for_lane(road.installed), track(road.lane, rng))
+    lane = fit_lane(markers_for_lane(road.installed), track(road.course, rng))
     assert lane.refusal is None
     errors = place_errors(road.lane, lane, 30.0, road.lane.length_m - 30.0)
     assert errors is not None
@@ -71,3 +76,94 @@ def test_a_track_that_jumps_between_lanes_gives_no_path_in_the_wrong_one() -> No
         errors = place_errors(road.lane, lane, 30.0, road.lane.length_m - 30.0) if lane.refusal is None else None
         worst_m.append(0.0 if errors is None else errors.worst_m)
     assert max(worst_m) < 1.0
+
+
+@pytest.mark.parametrize(("name", "lanes"), [("lane change", 2), ("overtaking", 3)])
+def test_each_stretch_says_in_which_lane_the_vehicle_was(name: str, lanes: int) -> None:
+    rng = np.random.default_rng(81)
+    road = make_topology(name, rng)
+    lane = fit_lane(markers_for_lane(road.installed), track(road.course, rng))
+    assert lane.refusal is None
+    stays = [stretch.lane for stretch in lane.stretches if not stretch.changing]
+    assert len(stays) == lanes
+    assert stays[-1] == 0
+    assert [abs(stay) for stay in stays[-2::-1]] == [1, 0][: lanes - 1]
+    assert lane.stretches[0].from_m == 0
+    assert lane.stretches[-1].to_m == pytest.approx(lane.station_m[-1])
+    assert all(a.to_m == b.from_m for a, b in itertools.pairwise(lane.stretches))
+    # where the vehicle was in the path's lane, its true way runs along the path
+    here = road.lane.enu_from_wgs84(lane.lon_deg, lane.lat_deg)
+    away, _ = scipy.spatial.cKDTree(road.course.centre_m).query(here)
+    for stretch in lane.stretches:
+        inside = (lane.station_m > max(stretch.from_m, 40.0)) & (
+            lane.station_m < min(stretch.to_m, lane.station_m[-1] - 40.0)
+        )
+        if stretch.changing or not inside.any():
+            continue
+        assert (away[inside] < 1.5).all() == (stretch.lane == 0), stretch
+
+
+def test_other_lanes_have_their_own_paths() -> None:
+    rng = np.random.default_rng(82)
+    road = make_topology("three lanes", rng)
+    lane = fit_lane(markers_for_lane(road.installed), track(road.lane, rng))
+    places = sorted(other.position for other in lane.beside)
+    assert places in ([1, 2], [-1, 1], [-2, -1])
+    width_m = float(np.median(lane.width_m))
+    for other in lane.beside:
+        line = scipy.spatial.cKDTree(other.lane.position_enu_m)
+        inner = (lane.station_m > 40.0) & (lane.station_m < lane.station_m[-1] - 40.0)
+        away, _ = line.query(lane.position_enu_m[inner])
+        assert float(np.sqrt(np.mean((away - abs(other.position) * width_m) ** 2))) < 0.15
+        assert float(np.median(other.lane.sigma_m)) < 0.03
+
+
+def test_an_oncoming_lane_runs_the_other_way() -> None:
+    rng = np.random.default_rng(83)
+    road = make_topology("oncoming lane", rng)
+    lane = fit_lane(markers_for_lane(road.installed), track(road.lane, rng))
+    (other,) = [one for one in lane.beside if one.position == 1]
+    assert other.direction == "oncoming"
+    middle = len(other.lane.heading_deg) // 2
+    nearest = int(scipy.spatial.cKDTree(lane.position_enu_m).query(other.lane.position_enu_m[middle])[1])
+    turned = (float(other.lane.heading_deg[middle]) - float(lane.heading_deg[nearest])) % 360.0
+    assert turned == pytest.approx(180.0, abs=5.0)
+
+
+def test_the_strength_of_passed_markers_shows_the_lane_to_a_coarse_receiver() -> None:
+    refused = {True: 0, False: 0}
+    for seed in range(84, 90):
+        rng = np.random.default_rng(seed)
+        road = make_topology("two lanes, shared line", rng)
+        heard = drive_past(road.course, road.installed, rng, sign=None, receiver=SatelliteReceiver.plain())
+        strengths = PacketStrengths(
+            road.installed.number[heard.sender],
+            np.array([packet.received_at_s for packet in heard.packets]),
+            np.array([packet.rssi_dbm for packet in heard.packets]),
+        )
+        markers = markers_for_lane(road.installed.chosen(np.isin(np.arange(len(road.installed)), heard.sender)))
+        for known in (True, False):
+            lane = fit_lane(markers, heard.track, strengths=strengths if known else None)
+            refused[known] += lane.refusal is not None
+            if lane.refusal is None:
+                errors = place_errors(road.lane, lane, 30.0, road.lane.length_m - 30.0)
+                assert errors is not None
+                assert errors.rms_m < 0.1
+    assert refused[True] < refused[False]
+
+
+def test_a_path_that_turns_aside_where_the_vehicle_does_not_is_unfit() -> None:
+    rng = np.random.default_rng(91)
+    road = make_topology("frontage road", rng)
+    own = road.installed.chosen(np.isin(road.installed.number, list(road.own)))
+    markers = markers_for_lane(own)
+    right = fit_lane(markers, track(road.lane, np.random.default_rng(92)))
+    assert not right.track_apart
+    k = len(road.lane.chainage_m) // 2
+    aside_m = 1.9 * np.array([-math.sin(road.lane.yaw_rad[k]), math.cos(road.lane.yaw_rad[k])])
+    half = own.chainage_m > own.chainage_m.mean()
+    lon_deg, lat_deg = road.lane.wgs84_from_enu(own.point_m + half[:, None] * aside_m)
+    moved = replace(markers, lon_deg=lon_deg, lat_deg=lat_deg)
+    wrong = fit_lane(moved, track(road.lane, np.random.default_rng(92)))
+    assert wrong.refusal is not None or wrong.track_apart
+    assert wrong.refusal is not None or any("turns aside" in text for text in wrong.localization_warnings)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, NotRequired, cast
 
 import numpy as np
 from typing_extensions import TypedDict
 
 from app.lanes.smooth_line import wgs84_from_plane
-from app.lanes.types import Lane, TrackAgreement
+from app.lanes.types import UNKNOWN, Lane, LaneBeside, LaneStretch, TrackAgreement
 from app.services.documents import document_of, listed
-from app.values import Floats
+from app.values import Floats, Ints
 
 if TYPE_CHECKING:  # it loads numba
     from app.simulation.steering import SteeringCheck
@@ -20,6 +20,7 @@ LonLat = list[list[float]]
 _STRAIGHT_PER_M = 1e-4
 GeometryType = Literal["LineString", "MultiLineString", "Point"]
 _OF_PATH = ("method", "localization_grade", "length_m", "sigma_median_m", "refusal", "speed_limits_kmh")
+_OF_OTHER_LANE = ("position", "direction", "length_m", "sigma_median_m", "markers")
 _OF_MARKER = ("number", "side", "left_out", "packets")
 _IN_GEOMETRY = ("lon_deg", "lat_deg")
 
@@ -49,8 +50,22 @@ class LaneStations(TypedDict):
     confidence: list[float | None]
 
 
+class OtherLaneDocument(TypedDict):
+    """The path of another lane whose markers were received, in its direction of travel where that is known.
+
+    `position` counts lanes to the left of the driven one: 1 is the next one on the left, -1 the next on the right.
+    """
+
+    position: int
+    direction: Literal["same", "oncoming", "unknown"]
+    length_m: float
+    sigma_median_m: float
+    markers: list[int]
+    path: LonLat
+
+
 class DecodedLaneDocument(TypedDict):
-    """The lane's reference path, at stations along it."""
+    """The lane's reference path, at stations along it; `stretches` say in which lane the vehicle was beside it."""
 
     method: str
     refusal: str | None
@@ -66,6 +81,8 @@ class DecodedLaneDocument(TypedDict):
     stations: LaneStations
     left: list[list[list[float]]]
     right: list[list[list[float]]]
+    stretches: NotRequired[list[LaneStretch]]
+    other_lanes: NotRequired[list[OtherLaneDocument]]
 
 
 class SteeringDocument(TypedDict):
@@ -104,11 +121,13 @@ class LaneCollection(TypedDict):
     features: list[LaneFeature]
 
 
-def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
+def lane_document(lane: Lane, markers: Ints, *, grade: str) -> DecodedLaneDocument:
     """A lane at stations along it; values that are not known are null.
 
     Parameters
     ----------
+    markers : ndarray of int, shape (K,)
+        Numbers of the markers that the lane was fitted to.
     grade : str
         Whether positions may be used to localize a vehicle.
     """
@@ -145,6 +164,20 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
         },
         "left": _pieces(lane.left_enu_m, origin),
         "right": _pieces(lane.right_enu_m, origin),
+        "stretches": list(lane.stretches),
+        "other_lanes": [_other_lane(other, markers) for other in lane.beside],
+    }
+
+
+def _other_lane(other: LaneBeside, markers: Ints) -> OtherLaneDocument:
+    lane = other.lane
+    return {
+        "position": other.position,
+        "direction": other.direction,
+        "length_m": round(float(lane.station_m[-1]), 3),
+        "sigma_median_m": round(float(np.median(lane.sigma_m)), 4),
+        "markers": sorted(set(markers[lane.side != UNKNOWN].tolist())),
+        "path": np.round(np.stack([lane.lon_deg, lane.lat_deg], 1), 9).tolist(),
     }
 
 
@@ -160,6 +193,9 @@ def lane_geojson(lane: DecodedLaneDocument, markers: Sequence[Mapping[str, objec
     for side, pieces in (("left", lane["left"]), ("right", lane["right"])):
         if pieces:
             features.append(_feature(f"{side} boundary", "MultiLineString", pieces, {}))
+    for other in lane.get("other_lanes", []):
+        properties = {name: other[name] for name in _OF_OTHER_LANE}  # type: ignore[literal-required]
+        features.append(_feature("other lane", "LineString", other["path"], properties))
     for marker in markers:
         if marker["lon_deg"] is not None:
             place = [marker["lon_deg"], marker["lat_deg"]]

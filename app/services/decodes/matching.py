@@ -42,7 +42,7 @@ from app.geodesy import (
     wgs84_from_enu,
     worst_grade,
 )
-from app.lanes.types import LaneMarkers
+from app.lanes.types import LaneMarkers, PacketStrengths
 from app.markers import reading
 from app.markers.cerpm import derive_marker_key
 from app.markers.magnet import InformationTag, parse_tag
@@ -387,6 +387,17 @@ def lane_markers(merged: MergedMarkers) -> LaneMarkers:
     return LaneMarkers(
         merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh
     )
+
+
+def packet_strengths(verification: Verification) -> PacketStrengths:
+    """How strongly authentic packets were received, for the lane's fit."""
+    heard = [
+        (packet.number, packet.packet.received_at_s, packet.packet.rssi_dbm)
+        for packet in verification.packets
+        if packet.accepted and packet.number is not None and math.isfinite(packet.packet.received_at_s)
+    ]
+    number, time_s, rssi_dbm = zip(*heard, strict=True) if heard else ((), (), ())
+    return PacketStrengths(np.array(number, np.int64), np.array(time_s, float), np.array(rssi_dbm, float))
 
 
 def spans_of(verification: Verification) -> list[dict[str, object]]:

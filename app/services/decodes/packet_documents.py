@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from datetime import datetime
 
@@ -151,9 +152,9 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     """The result of decoding a drive, as it is stored."""
     lane = result.lane
     markers = _markers(read, lane)
-    unsure = _path_warnings(lane)
+    unsure = path_warnings(lane)
     grade = LocalizationGrade.UNFIT if unsure or lane.track_apart else read.grade
-    document = lane_document(lane, grade=str(grade))
+    document = lane_document(lane, read.merged.number, grade=str(grade))
     document["localization_warnings"] += unsure
     document["localization_warnings"] += read.localization_warnings
     return {
@@ -169,7 +170,7 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     }
 
 
-def _path_warnings(lane: Lane) -> list[str]:
+def path_warnings(lane: Lane) -> list[str]:
     """Reasons why a path cannot localize a vehicle, however good its markers are."""
     if lane.refusal is not None:
         return [lane.refusal]
@@ -216,6 +217,8 @@ def _summary(files: DriveFiles, read: ReadPackets, markers: list[ReceivedMarkerD
     text += f"; {count_of(len(markers), 'marker')}"
     text += f", {len(others)} of other lanes" if others else ""
     text += f", left out: {', '.join(str(number) for number in named)}" if named else ""
+    changes = sum(before.lane != after.lane for before, after in itertools.pairwise(lane.stretches))
+    text += f"; the vehicle changed lane {'once' if changes == 1 else f'{changes} times'}" if changes else ""
     if lane.refusal is None and np.isfinite(lane.sigma_m).all():
         text += f"; path of {length_m:.0f} m, ± {100 * float(np.median(lane.sigma_m)):.1f} cm"
     else:

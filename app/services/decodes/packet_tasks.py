@@ -20,7 +20,7 @@ from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.parts import open_parts
 from app.lanes.overlay import LaneInFrame, LaneOverlay, VehiclePose, lane_in_frame, ned_from_enu
 from app.lanes.smooth_line import plane_from_wgs84
-from app.lanes.types import Lane, LaneMarkers, LaneRules
+from app.lanes.types import Lane, LaneMarkers, LaneRules, PacketStrengths
 from app.plots.annotated_frame import draw_lane, encode_picture
 from app.plots.lane import SignalPicture, picture_of_lane, plot_lane
 from app.sensors.camera import Camera
@@ -134,6 +134,7 @@ class LaneResult:
 @decoder_task(*_LOG)
 def estimate_lane(
     markers: LaneMarkers,
+    strengths: PacketStrengths,
     left_out: tuple[LeftOutMarker, ...],
     track: PoseTrack | None,
     declared: DeclaredPackets,
@@ -144,7 +145,8 @@ def estimate_lane(
     from app.lanes.estimate import fit_lane
 
     began = time.perf_counter()
-    lane = fit_lane(markers, track, method=declared.method, rules=LaneRules.of(declared.lane))
+    rules = LaneRules.of(declared.lane)
+    lane = fit_lane(markers, track, method=declared.method, rules=rules, strengths=strengths)
     steering = _check_steering(lane, declared.steering)
     overlay = _overlay(lane, markers, camera)
     decode_ms = 1e3 * (time.perf_counter() - began)

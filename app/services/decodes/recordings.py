@@ -31,6 +31,7 @@ from app.services.decodes.matching import (
     find_known,
     find_nearby_tags,
     lane_markers,
+    packet_strengths,
     read_packets_of,
     spans_of,
 )
@@ -274,6 +275,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
         lane = self._processes.run(
             estimate_lane,
             lane_markers(read.merged),
+            packet_strengths(read.verification),
             _left_out(read),
             files.track,
             declared,

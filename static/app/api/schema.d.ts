@@ -3417,12 +3417,14 @@ export interface components {
             method: string;
             min_radius_m: number | null;
             origin: components["schemas"]["Origin"];
+            other_lanes?: components["schemas"]["OtherLaneDocument"][];
             refusal: string | null;
             right: number[][][];
             sigma_max_m: number | null;
             sigma_median_m: number | null;
             speed_limits_kmh: number[];
             stations: components["schemas"]["LaneStations"];
+            stretches?: components["schemas"]["LaneStretch"][];
             track_agreement: components["schemas"]["TrackAgreement"] | null;
         };
         DecodeDocument: components["schemas"]["FramesDecode"] | components["schemas"]["TraceDecode"] | components["schemas"]["PacketsDecode"];
@@ -4418,6 +4420,12 @@ export interface components {
             station_m: (number | null)[];
             width_m: (number | null)[];
         };
+        LaneStretch: {
+            changing: boolean;
+            from_m: number;
+            lane: number;
+            to_m: number;
+        };
         LaneSummary: {
             design_speed_kmh: number[] | null;
             left_style: string;
@@ -4978,6 +4986,15 @@ export interface components {
             state: "queued" | "running" | "done" | "failed" | "cancelled";
             subject_id: string | null;
             total: number | null;
+        };
+        OtherLaneDocument: {
+            /** @enum {string} */
+            direction: "same" | "oncoming" | "unknown";
+            length_m: number;
+            markers: number[];
+            path: number[][];
+            position: number;
+            sigma_median_m: number;
         };
         PackageJob: {
             attempts: number;

@@ -116,6 +116,27 @@ def test_a_road_of_two_lanes_gives_the_driven_one(server: LiveServer) -> None:
         assert all(marker["registered"] and marker["authentic"] for marker in found["markers"])
         seen = client.get(f"/v1/markers/{built.markers[-1]['id']}/observations").json()
         assert [one["what"] for one in seen["items"]] == ["seen"]
+        (other,) = found["lane"]["other_lanes"]
+        assert abs(other["position"]) == 1
+        assert others <= set(other["markers"])
+        assert len(other["path"]) > 400
+        shapes = client.get(f"/v1/decodes/{found['id']}/lane.geojson").json()["features"]
+        assert [shape["geometry"]["type"] for shape in shapes if shape["properties"]["kind"] == "other lane"] == [
+            "LineString"
+        ]
+
+
+def test_a_change_of_lane_is_in_the_result(server: LiveServer) -> None:
+    with server.agency(f"roads {next(_AGENCIES)}", Scope.ADMIN) as client:
+        road = make_topology("lane change", np.random.default_rng(1953))
+        built = register_lane(client, road.lane, road.installed)
+        heard, _hour = drive(replace(built, lane=road.course), 1954)
+        found = decoded(client, packed(heard))
+        assert path_rms_m(built, found) < 0.03
+        stays = [stretch["lane"] for stretch in found["lane"]["stretches"] if not stretch["changing"]]
+        assert stays in ([1, 0], [-1, 0])
+        assert "changed lane once" in found["summary"]["text"]
+        assert found["lane"]["localization_grade"] == "cm", found["lane"]["localization_warnings"]
 
 
 # --- what a drive gives -------------------------------------------------------------------------------------------
