@@ -3368,7 +3368,7 @@ export interface components {
              * @default predictive
              * @enum {string}
              */
-            steering?: "predictive" | "stanley" | "stanley-lookahead" | "none";
+            steering?: "predictive" | "mpc" | "stanley" | "stanley-lookahead" | "none";
         };
         DeclaredTrace: {
             /** @default null */
