@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from benchmarks.scenes.road_shapes import RoadShape, lane_of_shape
 REFERENCE = Path(__file__).parents[1] / "reference" / "cerpm.csv"
 _DAY_S = 86_400.0
 Spans = Mapping[int, Sequence[SequenceSpan]]
+Method = Literal["waymark", "paper"]
 
 
 def paper_figure(quantity: str) -> float:
@@ -189,7 +191,7 @@ class TrackingRow:
         self.checks: list[SteeringCheck] = []
         self.cpu_s = 0.0
 
-    def drive(self, lane: TrueLane, per_side: int | None, rng: np.random.Generator, method: str = "waymark") -> None:
+    def drive(self, lane: TrueLane, per_side: int | None, rng: np.random.Generator, method: Method = "waymark") -> None:
         """Install markers, decode the lane's path, and drive along it."""
         installed = scenes.install(lane, rng, per_side)
         path = fit_lane(scenes.markers_for_lane(installed), scenes.track(lane, rng), method=method)
@@ -334,7 +336,7 @@ def draw_route(route: PaperRoute, rng: np.random.Generator) -> TrueLane:
 def run_routes(seed: int, short: bool) -> Result:
     """The paper's three routes, with its own way and with others."""
     rows: list[Sequence[object]] = []
-    ways = (
+    ways: tuple[tuple[str, Method, Controller], ...] = (
         ("paper's path, Stanley with 15 m look-ahead", "paper", Controller.STANLEY_LOOKAHEAD),
         ("paper's path, Stanley", "paper", Controller.STANLEY),
         ("Stanley", "waymark", Controller.STANLEY),

@@ -6515,6 +6515,8 @@ export interface components {
             mse_m2: number | null;
             refusal: string | null;
             rms_m: number | null;
+            steer_rate_max_deg_s: number | null;
+            unsolved_steps: number | null;
         };
         SurveyIn: {
             /** @default null */
