@@ -35,11 +35,13 @@ class Controller(StrEnum):
 
     ``stanley`` is equation 4 of the CERPM paper, ``stanley-lookahead`` its equation 5. ``predictive`` is equation 4 at
     the pose where the vehicle will be when the command takes effect, and a slow integral for wheels that stand askew.
+    ``mpc`` is model predictive control (`app.lanes.mpc`), with the same prediction and integral.
     """
 
     STANLEY = "stanley"
     STANLEY_LOOKAHEAD = "stanley-lookahead"
     PREDICTIVE = "predictive"
+    MPC = "mpc"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,24 +52,38 @@ class SteeringSettings:
     gain_per_s: float = 1.0  # [1/s] `suited_to`
     # [m] d_l of equation 5
     lookahead_m: float = 15.0  # [m] source: CERPM paper, section 2.3.2
-    # `latency_s`, `lag_s`, `wheelbase_m`: of the vehicle, as assumed by the predictive controller. [s, s, m]
+    # `latency_s`, `lag_s`, `wheelbase_m`: of the vehicle, as assumed by the predictive controllers. [s, s, m]
     latency_s: float = 0.12  # [s] source: `simulation.steering.Vehicle`
     lag_s: float = 0.10  # [s] source: `simulation.steering.Vehicle`
     wheelbase_m: float = 2.70  # [m] source: Kia Niro, the paper's car
-    # [rad/(m s)] steering of the predictive controller per integrated cross-track error
+    # [rad/(m s)] steering of the predictive controllers per integrated cross-track error
     integral_per_m_s: float = 0.06  # [rad/(m s)]
+    # of model predictive control: limits of the front wheels; horizon; weights of lateral velocity and of lateral jerk
+    # beside the cross-track error
+    max_steer_deg: float = 32.0  # [deg] source: `simulation.steering.Vehicle`
+    max_steer_rate_deg_s: float = 30.0  # [deg/s] source: `simulation.steering.Vehicle`
+    horizon_s: float = 1.0  # [s]
+    velocity_weight_s: float = 0.3  # [s]
+    jerk_weight_s3: float = 0.015  # [s3]
 
     def __post_init__(self) -> None:
         for name, low, high in (
             ("gain_per_s", 0.01, 20.0), ("lookahead_m", 0.0, 100.0), ("latency_s", 0.0, 0.5), ("lag_s", 0.0, 1.0),
-            ("wheelbase_m", 0.5, 20.0), ("integral_per_m_s", 0.0, 1.0),
+            ("wheelbase_m", 0.5, 20.0), ("integral_per_m_s", 0.0, 1.0), ("max_steer_deg", 1.0, 60.0),
+            ("max_steer_rate_deg_s", 1.0, 500.0), ("horizon_s", 0.2, 5.0), ("velocity_weight_s", 0.0, 10.0),
+            ("jerk_weight_s3", 1e-4, 10.0),
         ):  # fmt: skip
             check_range(getattr(self, name), low, high, f"settings.{name}")
 
     @classmethod
     def suited_to(cls, controller: Controller) -> SteeringSettings:
         """Gains chosen by hand for bends at 40 km/h; the paper does not print its own."""
-        gains = {Controller.STANLEY: 1.0, Controller.STANLEY_LOOKAHEAD: 0.2, Controller.PREDICTIVE: 2.0}
+        gains = {
+            Controller.STANLEY: 1.0,
+            Controller.STANLEY_LOOKAHEAD: 0.2,
+            Controller.PREDICTIVE: 2.0,
+            Controller.MPC: 1.0,
+        }
         return cls(gain_per_s=gains[controller])
 
 

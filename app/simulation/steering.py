@@ -22,6 +22,7 @@ from app.lanes.control import (
     predict_pose,
     stanley_rad,
 )
+from app.lanes.mpc import MpcSteering
 from app.values import Floats
 
 # === A car as a kinematic bicycle whose steering has limits, a lag and a delay, and the errors of its poses.
@@ -135,6 +136,7 @@ _SPEED_AHEAD_S = 0.5  # [s] the target speed is that of the path this far ahead;
 _MAX_START_SINE = 0.5  # of the wheels' angle at the start; 30 degrees
 ENDINGS = ("reached the end", "left the path", "took too long")
 REACHED_END, _LEFT_PATH, _TOOK_TOO_LONG = range(3)
+_ON_PATH = -1  # the drive goes on
 
 
 class Course(NamedTuple):
@@ -253,25 +255,60 @@ def drive_course(course, start, errors, law, car):  # type: ignore[no-untyped-de
     state, control, integral = start, SpeedControl(0.0, 0.0), 0.0
     near, seen, far = 0, 0, min(int(law.lookahead_m / course.step_m), last - 1)
     for k in range(errors.shape[0]):
-        front_x = state.x + car.wheelbase_m * math.cos(state.yaw)
-        front_y = state.y + car.wheelbase_m * math.sin(state.yaw)
-        near, share, left = nearest_on_path(course.points, front_x, front_y, near)
-        station = (near + share) * course.step_m
-        planned = _speed_at(course, station)
-        rows[k] = (state.x, state.y, state.yaw, state.speed, planned, state.wheel, station, left)
-        if near == last - 1 and share >= 1.0:
-            return rows[: k + 1], REACHED_END
-        if not abs(left) <= OFF_PATH_M:
-            return rows[: k + 1], _LEFT_PATH
+        near, ending = _measure(course, state, car, near, rows[k])
+        if ending != _ON_PATH:
+            return rows[: k + 1], ending
         steer, error, seen, far = _steer(course, state, errors[k], law, car, sent[depth - waiting :], held, seen, far)
         if abs(error) < _INTEGRATED_M:
             integral -= law.integral_per_m_s * error * STEP_S
             integral = min(max(integral, -_MAX_INTEGRAL_RAD), _MAX_INTEGRAL_RAD)
-        sent[:-1] = sent[1:]
-        sent[-1] = min(max(steer + integral, -car.max_steer_rad), car.max_steer_rad)
-        target = _speed_at(course, station + _SPEED_AHEAD_S * state.speed)
-        state, control = _step(state, sent[depth - 1 - car.latency_steps], target, control, car, k == 0)
+        state, control = _send_and_step(course, state, control, car, steer + integral, sent, rows[k, 6], k == 0)
     return rows, _TOOK_TOO_LONG
+
+
+def drive_course_by_mpc(
+    course: Course, start: State, errors: Floats, latency_s: float, car: Car, steering: MpcSteering
+) -> tuple[Floats, int]:
+    """Simulate a drive as `drive_course` does, but steered by model predictive control, which assumes a latency."""
+    waiting = round(latency_s / STEP_S)
+    sent = np.full(max(car.latency_steps, waiting) + 1, start.wheel - car.misalignment_rad)
+    rows = np.empty((len(errors), 8))
+    state, control, near = start, SpeedControl(0.0, 0.0), 0
+    for k, (east_m, north_m, yaw_rad) in enumerate(errors.tolist()):
+        near, ending = _measure(course, state, car, near, rows[k])
+        if ending != _ON_PATH:
+            return rows[: k + 1], ending
+        pose = state.x + east_m, state.y + north_m, state.yaw + yaw_rad
+        wheel = state.wheel - car.misalignment_rad
+        command, _error = steering.steer(*pose, state.speed, wheel, sent[len(sent) - waiting :], STEP_S)
+        state, control = _send_and_step(course, state, control, car, command, sent, rows[k, 6], k == 0)
+    return rows, _TOOK_TOO_LONG
+
+
+@ieee_kernel
+def _measure(course, state, car, near, row):  # type: ignore[no-untyped-def]
+    """Write a row of `drive_course`; returns the nearest piece of the path, and how the drive ends if it does."""
+    front_x = state.x + car.wheelbase_m * math.cos(state.yaw)
+    front_y = state.y + car.wheelbase_m * math.sin(state.yaw)
+    near, share, left = nearest_on_path(course.points, front_x, front_y, near)
+    station = (near + share) * course.step_m
+    values = (state.x, state.y, state.yaw, state.speed, _speed_at(course, station), state.wheel, station, left)
+    for column in range(8):
+        row[column] = values[column]
+    if near == course.points.shape[0] - 2 and share >= 1.0:
+        return near, REACHED_END
+    if not abs(left) <= OFF_PATH_M:
+        return near, _LEFT_PATH
+    return near, _ON_PATH
+
+
+@ieee_kernel
+def _send_and_step(course, state, control, car, command, sent, station, first):  # type: ignore[no-untyped-def]
+    """State and speed control one step after a command [rad] was sent; ``sent`` has all commands, newest last."""
+    sent[:-1] = sent[1:]
+    sent[-1] = min(max(command, -car.max_steer_rad), car.max_steer_rad)
+    target = _speed_at(course, station + _SPEED_AHEAD_S * state.speed)
+    return _step(state, sent[sent.shape[0] - 1 - car.latency_steps], target, control, car, first)
 
 
 @ieee_kernel
@@ -380,7 +417,9 @@ class SteeringCheck:
     # `path_rms_m`, `rear_rms_m`: [m] front axle against the path driven, rear axle's centre against the true line
     path_rms_m: float
     rear_rms_m: float
-    steer_rate_rms_deg_s: float  # [deg/s] steering effort: RMS rate of the front wheels
+    # `steer_rate_rms_deg_s`, `steer_rate_max_deg_s`: [deg/s] steering effort: rates of the front wheels
+    steer_rate_rms_deg_s: float
+    steer_rate_max_deg_s: float
     lateral_acceleration_m_s2: float  # [m/s2] largest
     # `mean_speed_m_s`, `excess_speed_m_s`: [m/s] mean speed, and the maximum by which the planned speed (the limit or
     # less) was exceeded
@@ -390,6 +429,7 @@ class SteeringCheck:
     duration_s: float
     completed: bool  # whether the front axle reached the path's end
     ended: str  # why the drive ended
+    unsolved_steps: int  # steps in which model predictive control found no solution, steered by equation 4
     trace: SteeringTrace
 
 
@@ -458,8 +498,14 @@ def check_steering(
     errors = draw_pose_errors(noise, steps, rng or np.random.default_rng(0))
     course = Course(path.position_enu_m, path.heading_rad, speed, path.step_m)
     start = start_on_bend(course, float(path.curvature_per_m[0]), start_offset_m, vehicle.wheelbase_m)
-    rows, ending = drive_course(course, start, errors, law_values(law, settings), car_values(vehicle))
-    return _evaluate(law, rows, path, truth, vehicle, ENDINGS[ending])
+    car, unsolved = car_values(vehicle), 0
+    if law is Controller.MPC:
+        steering = MpcSteering(path, settings)
+        rows, ending = drive_course_by_mpc(course, start, errors, settings.latency_s, car, steering)
+        unsolved = steering.unsolved_steps
+    else:
+        rows, ending = drive_course(course, start, errors, law_values(law, settings), car)
+    return _evaluate(law, rows, path, truth, vehicle, ENDINGS[ending], unsolved)
 
 
 def _known_controller(controller: Controller | str) -> Controller:
@@ -493,7 +539,7 @@ def _errors_along(points, track, first):  # type: ignore[no-untyped-def]
 
 
 def _evaluate(
-    law: Controller, rows: Floats, path: FollowedPath, truth: FollowedPath, vehicle: Vehicle, ended: str
+    law: Controller, rows: Floats, path: FollowedPath, truth: FollowedPath, vehicle: Vehicle, ended: str, unsolved: int
 ) -> SteeringCheck:
     """Errors of the rows of a drive."""
     rear, yaw, speed, wheel = rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 5]
@@ -527,6 +573,7 @@ def _evaluate(
         path_rms_m=math.sqrt(mean(rows[:, 7] ** 2, everywhere)),
         rear_rms_m=math.sqrt(mean(rear_errors[:, 0] ** 2, behind)),
         steer_rate_rms_deg_s=math.sqrt(float(np.mean(rates**2))),
+        steer_rate_max_deg_s=float(np.abs(rates).max()),
         lateral_acceleration_m_s2=float(lateral.max()),
         mean_speed_m_s=float(speed.mean()),
         excess_speed_m_s=max(float(np.max(speed - rows[:, 4])), 0.0),
@@ -534,6 +581,7 @@ def _evaluate(
         duration_s=len(rows) * STEP_S,
         completed=ended == ENDINGS[REACHED_END],
         ended=ended,
+        unsolved_steps=unsolved,
         trace=trace,
     )
 

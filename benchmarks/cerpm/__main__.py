@@ -1,6 +1,6 @@
 """``python -m benchmarks.cerpm [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: path, lanes, spoof, forged, dirty, tracking, radio, speed, physics, all.
+Items: path, lanes, spoof, forged, dirty, tracking, routes, radio, europe, speed, physics, all.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 
 from benchmarks.cerpm.driven_lane import run_lanes
-from benchmarks.cerpm.packets_and_steering import run_forged, run_radio, run_speed, run_tracking
+from benchmarks.cerpm.europe import run_europe
+from benchmarks.cerpm.packets_and_steering import run_forged, run_radio, run_routes, run_speed, run_tracking
 from benchmarks.cerpm.paths import Result, run_dirty, run_path, run_spoof
 from benchmarks.cerpm.physics import run_physics
 
 RUNS: dict[str, Callable[[int, bool], Result]] = {
     "path": run_path, "lanes": run_lanes, "spoof": run_spoof, "forged": run_forged, "dirty": run_dirty,
-    "tracking": run_tracking, "radio": run_radio, "speed": run_speed, "physics": run_physics,
+    "tracking": run_tracking, "routes": run_routes, "radio": run_radio, "europe": run_europe, "speed": run_speed,
+    "physics": run_physics,
 }  # fmt: skip
 ITEMS = tuple(RUNS)
 

@@ -157,7 +157,10 @@ def test_prediction_waits_out_commands_under_way():
     assert angle == pytest.approx(0.1 * (1 - math.exp(-1)), rel=0.05)  # one time constant
 
 
-@pytest.mark.parametrize("values", [{"gain_per_s": 0.0}, {"latency_s": math.nan}, {"lookahead_m": -1.0}])
+@pytest.mark.parametrize(
+    "values",
+    [{"gain_per_s": 0.0}, {"latency_s": math.nan}, {"lookahead_m": -1.0}, {"horizon_s": 0.0}, {"jerk_weight_s3": 0.0}],
+)
 def test_settings_out_of_range_are_refused(values):
     with pytest.raises(InvalidParameter) as caught:
         SteeringSettings(**values)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from app.errors import InvalidParameter
-from app.lanes.control import Controller, SteeringSettings
+from app.lanes.control import Controller, SteeringSettings, follow_path, plan_speed, stanley_rad
+from app.lanes.mpc import MpcSteering
+from app.simulation import steering
 from app.simulation.steering import PoseNoise, Vehicle, check_steering, draw_pose_errors
 
 pytestmark = pytest.mark.slow
@@ -68,6 +70,9 @@ def test_paper_s_laws_cut_what_the_prediction_follows():
     assert all(check.controller is law for law, check in checks.items())
     assert checks[Controller.PREDICTIVE].rms_m < 0.005
     assert checks[Controller.PREDICTIVE].max_m < 0.02
+    assert checks[Controller.MPC].rms_m < 0.005
+    assert checks[Controller.MPC].max_m < 0.02
+    assert checks[Controller.MPC].unsolved_steps == 0
     assert 0.005 < checks[Controller.STANLEY].rms_m < 0.1
     assert checks[Controller.STANLEY_LOOKAHEAD].rms_m > 0.3
 
@@ -98,17 +103,18 @@ def test_a_steady_bend_is_driven_by_its_geometry():
 
 @pytest.mark.parametrize("radius_m", [8.0, 15.0, 24.0, 60.0])
 def test_bends_are_stable(radius_m):
-    for law in (Controller.PREDICTIVE, Controller.STANLEY):
+    for law in (Controller.PREDICTIVE, Controller.MPC, Controller.STANLEY):
         check = check_steering(lane(radius_m, 270.0), 40.0, controller=law)
         assert check.completed
-        assert check.max_m < (0.05 if law is Controller.PREDICTIVE else 0.35)
+        assert check.max_m < (0.35 if law is Controller.STANLEY else 0.05)
 
 
+@pytest.mark.parametrize("law", [Controller.PREDICTIVE, Controller.MPC])
 @pytest.mark.parametrize("speed_kmh", [60.0, 100.0, 130.0])
-def test_an_offset_dies_out_at_any_speed(speed_kmh):
+def test_an_offset_dies_out_at_any_speed(speed_kmh, law):
     path = np.column_stack([np.arange(0.0, 800.0), np.zeros(800)])
     for offset_m in (0.5, -0.5):
-        check = check_steering(path, speed_kmh, start_offset_m=offset_m)
+        check = check_steering(path, speed_kmh, controller=law, start_offset_m=offset_m)
         assert check.completed
         assert check.trace.path_error_m[0] == pytest.approx(offset_m)
         assert np.abs(check.trace.path_error_m[400:]).max() < 0.02
@@ -132,11 +138,52 @@ def test_delay_makes_equation_4_unstable_at_80_km_h_and_the_check_says_so():
         Vehicle(steer_offset_deg=0.3), Vehicle(max_steer_rate_deg_s=20.0),
     ],
 )  # fmt: skip
-def test_a_vehicle_that_is_not_as_the_controller_believes(vehicle):
-    check = check_steering(clothoid(), 40.0, vehicle=vehicle, noise=PoseNoise(), rng=np.random.default_rng(1003))
-    assert check.completed
-    assert check.rms_m < 0.025
-    assert check.max_m < 0.12
+def test_a_vehicle_that_is_not_as_the_controller_assumes(vehicle):
+    for law in (Controller.PREDICTIVE, Controller.MPC):
+        rng = np.random.default_rng(1003)
+        check = check_steering(clothoid(), 40.0, controller=law, vehicle=vehicle, noise=PoseNoise(), rng=rng)
+        assert check.completed
+        assert check.rms_m < 0.025
+        assert check.max_m < 0.12
+
+
+def test_model_predictive_control_steers_more_calmly_at_the_same_error():
+    truth = clothoid()
+    checks = {}
+    for law in (Controller.PREDICTIVE, Controller.MPC):
+        rng = np.random.default_rng(1004)
+        path = wobbly(truth, 0.020, 6.0, rng)
+        checks[law] = check_steering(path, 50.0, controller=law, truth_enu_m=truth, noise=PoseNoise(), rng=rng)
+    assert checks[Controller.MPC].rms_m < 1.05 * checks[Controller.PREDICTIVE].rms_m
+    assert checks[Controller.MPC].steer_rate_rms_deg_s < 0.8 * checks[Controller.PREDICTIVE].steer_rate_rms_deg_s
+    for check in checks.values():
+        assert check.steer_rate_rms_deg_s < check.steer_rate_max_deg_s <= Vehicle().max_steer_rate_deg_s + 1e-9
+
+
+def test_two_loops_of_the_simulation_are_the_same_drive():
+    """`drive_course_by_mpc` with equation 4 in place of the program gives the drive of `drive_course`."""
+    path = follow_path(clothoid())
+    speed = plan_speed(path, clothoid(), 40.0)
+    course = steering.Course(path.position_enu_m, path.heading_rad, speed, path.step_m)
+    car, settings = steering.car_values(Vehicle()), SteeringSettings()
+    start = steering.start_on_bend(course, 0.0, 0.1, 2.7)
+    errors = draw_pose_errors(PoseNoise(), 10_000, np.random.default_rng(4))
+
+    class Stanley(MpcSteering):
+        piece = 0
+
+        def steer(self, x, y, yaw, speed, wheel, pending, step_s):
+            front = x + 2.7 * math.cos(yaw), y + 2.7 * math.sin(yaw)
+            command, left, self.piece, _ = stanley_rad(
+                path.position_enu_m, path.heading_rad, *front, yaw, speed, settings.gain_per_s, 0.0, self.piece, 0
+            )
+            return command, left
+
+    law = steering.law_values(Controller.STANLEY, settings)
+    expected, ending = steering.drive_course(course, start, errors, law, car)
+    found, same_ending = steering.drive_course_by_mpc(course, start, errors, 0.0, car, Stanley(path, settings))
+    assert ending == same_ending == steering.REACHED_END
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_kinks_and_coarse_polylines_are_driven():

@@ -56,8 +56,10 @@ class DeclaredPackets(PacketDeclaration):
         False,
         description="Use markers whose packets were received in clear only; the path is then not for localization.",
     )
-    steering: Literal["predictive", "stanley", "stanley-lookahead", "none"] = Field(
-        "predictive", description="Controller of the simulated drive along the path."
+    steering: Literal["predictive", "mpc", "stanley", "stanley-lookahead", "none"] = Field(
+        "predictive",
+        description="Controller of the simulated drive along the path. `mpc` is model predictive control, which takes "
+        "about 1 s of processor time a kilometre.",
     )
 
 

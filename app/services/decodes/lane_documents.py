@@ -94,9 +94,11 @@ class SteeringDocument(TypedDict):
     rms_m: float | None
     max_m: float | None
     mse_m2: float | None
+    steer_rate_max_deg_s: float | None
     mean_speed_m_s: float | None
     lateral_acceleration_m_s2: float | None
     distance_m: float | None
+    unsolved_steps: int | None
 
 
 class LaneGeometry(TypedDict):

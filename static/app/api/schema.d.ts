@@ -3368,7 +3368,7 @@ export interface components {
              * @default predictive
              * @enum {string}
              */
-            steering?: "predictive" | "stanley" | "stanley-lookahead" | "none";
+            steering?: "predictive" | "mpc" | "stanley" | "stanley-lookahead" | "none";
         };
         DeclaredTrace: {
             /** @default null */
@@ -6532,6 +6532,8 @@ export interface components {
             mse_m2: number | null;
             refusal: string | null;
             rms_m: number | null;
+            steer_rate_max_deg_s: number | null;
+            unsolved_steps: number | null;
         };
         SurveyIn: {
             /** @default null */

@@ -1376,6 +1376,7 @@ export default {
   "option.metre_of_lane": "Meter Spur",
   "option.metro": "wie im METRO-Artikel",
   "option.motorway": "Autobahn",
+  "option.mpc": "modellprädiktive Regelung",
   "option.named": "nach ihren Namen",
   "option.nearest": "dem nächsten Marker",
   "option.night": "Nacht",

@@ -1376,6 +1376,7 @@ export default {
   "option.metre_of_lane": "metre of lane",
   "option.metro": "as in the METRO paper",
   "option.motorway": "motorway",
+  "option.mpc": "model predictive control",
   "option.named": "by their names",
   "option.nearest": "the nearest marker",
   "option.night": "night",

@@ -207,6 +207,24 @@ def test_a_drive_gives_the_lane_its_pictures_and_observations(road: tuple[httpx.
         assert strengths["distance_m"][-1] == pytest.approx(health["farthest_m"], abs=0.1)
 
 
+@pytest.mark.slow
+def test_the_path_is_driven_by_the_controller_that_is_asked_for(road: tuple[httpx.Client, BuiltLane]) -> None:
+    client, built = road
+    heard, _hour = drive(built, 1903)
+    driven = {
+        law: decoded(client, packed(heard), {"packets": {"steering": law}})["steering"]
+        for law in ("predictive", "mpc", "stanley", "none")
+    }
+    assert driven.pop("none") is None
+    assert [steering["controller"] for steering in driven.values()] == list(driven)
+    assert all(steering["completed"] and steering["unsolved_steps"] == 0 for steering in driven.values())
+    assert driven["mpc"]["max_m"] < 0.1
+    assert driven["mpc"]["steer_rate_max_deg_s"] < driven["predictive"]["steer_rate_max_deg_s"]
+    refused = post(client, packed(heard), {"packets": {"steering": "pure-pursuit"}})
+    assert refused.status_code == 422
+    assert "mpc" in refused.text
+
+
 def test_a_track_of_another_day_is_said(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     heard, _hour = drive(built, 1915)
