@@ -1,6 +1,6 @@
 """``python -m benchmarks.cerpm [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: path, spoof, forged, dirty, tracking, radio, speed, physics, all.
+Items: path, spoof, forged, dirty, tracking, radio, speed, physics, europe, all.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
 
+from benchmarks.cerpm.europe import run_europe
 from benchmarks.cerpm.packets_and_steering import run_forged, run_radio, run_speed, run_tracking
 from benchmarks.cerpm.paths import Result, run_dirty, run_path, run_spoof
 from benchmarks.cerpm.physics import run_physics
@@ -16,6 +17,7 @@ from benchmarks.cerpm.physics import run_physics
 RUNS: dict[str, Callable[[int, bool], Result]] = {
     "path": run_path, "spoof": run_spoof, "forged": run_forged, "dirty": run_dirty, "tracking": run_tracking,
     "radio": run_radio, "speed": run_speed, "physics": run_physics,
+    "europe": run_europe,
 }  # fmt: skip
 ITEMS = tuple(RUNS)
 
