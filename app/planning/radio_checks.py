@@ -32,6 +32,7 @@ from app.radio.regulation import check_legal, check_transmitter, is_permitted
 from app.radio.settings import (
     BANDWIDTHS_HZ,
     DATA_RATES,
+    MAX_BATTERY_DAYS,
     SPREADING_FACTORS,
     Battery,
     RadioSettings,
@@ -310,8 +311,8 @@ _WANTED = 8  # markers that are approached; bounds the time of the search
 class Recommendation:
     """The best lawful settings that were found."""
 
-    # those with the longest battery life that reach the required probability; if none does, those with the highest
-    # probability
+    # those with the longest battery life that reach the required probability, of equal ones the most probable; if none
+    # does, those with the highest probability
     radio: Annotated[RadioSettings | None, Field(description="Null where nothing is lawful.")]
     receiver_channels: int  # channels that the receiver must receive at the same time
     read_probability: float
@@ -380,7 +381,7 @@ def in_slots(plan: RadioPlan) -> RadioPlan:
 
 
 def _best(plan: RadioPlan, approaches_by_link: _ApproachesByLink) -> Recommendation:
-    reaching: tuple[float, RadioSettings, float] | None = None
+    reaching: tuple[float, float, RadioSettings] | None = None
     likeliest: tuple[float, RadioSettings] | None = None
     for first in _modulations(plan):
         approaches = approaches_by_link.find(first)
@@ -394,12 +395,12 @@ def _best(plan: RadioPlan, approaches_by_link: _ApproachesByLink) -> Recommendat
                 likeliest = probability, settings
             if probability >= plan.min_probability:
                 days = battery_life_days(settings, plan.battery)
-                if reaching is None or days > reaching[0]:
-                    reaching = days, settings, probability
-                if settings.slotted:
+                if reaching is None or (days, probability) > reaching[:2]:
+                    reaching = days, probability, settings
+                if settings.slotted and days < MAX_BATTERY_DAYS:
                     break  # with shorter intervals the battery lasts less
     if reaching is not None:
-        return _recommendation(plan, reaching[1], reaching[2])
+        return _recommendation(plan, reaching[2], reaching[1])
     return _recommendation(plan, likeliest[1], likeliest[0]) if likeliest else _recommendation(plan, None, 0.0)
 
 

@@ -248,7 +248,7 @@ def assign_places(points_m: npt.ArrayLike, capacity: int) -> Ints:
     tree = scipy.spatial.cKDTree(points)
     for start in range(0, len(points), _PLACES_AT_ONCE):
         _distance, near = tree.query(points[start : start + _PLACES_AT_ONCE], k=[*range(1, count + 1)])
-        for k, row in enumerate(near, start):
+        for k, row in enumerate(np.atleast_2d(near), start):
             rank = np.full(capacity, len(points))  # of the nearest user of each place
             taken = place[row][::-1]  # the nearest ones last, so that they count
             rank[taken[taken >= 0]] = np.arange(len(row))[::-1][taken >= 0]

@@ -303,6 +303,16 @@ def test_in_europe_slots_on_polite_channels_are_recommended(frequency_hz: int) -
     assert check_radio(replace(received, radio=rarer)).read_probability < plan.min_probability
 
 
+def test_of_settings_that_a_solar_cell_carries_the_most_probable_are_recommended() -> None:
+    plan = RadioPlan(EUROPE, region=Region.EU868, battery=Battery(sleep_ma=0.008, awake_ma=4.0, transmit_ma=25.5))
+    dark = recommend_settings(plan)
+    sunny = recommend_settings(replace(plan, battery=replace(plan.battery, solar_mw=400.0)))
+    assert dark.battery_days < 100
+    assert sunny.battery_days == MAX_BATTERY_DAYS
+    assert sunny.read_probability > dark.read_probability
+    assert sunny.read_probability > 0.999
+
+
 def test_slots_too_few_for_the_markers_in_range_are_named() -> None:
     radio = replace(in_slots(RadioPlan(EUROPE, region=Region.EU868)).radio, interval_s=0.1, spreading_factor=7)
     check = check_radio(RadioPlan(radio, Region.EU868, receiver=Receiver(channels=10)))
