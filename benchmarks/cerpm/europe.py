@@ -43,8 +43,8 @@ _GFSK_S = 8 * (5 + 4 + 1 + 24 + 2) / 4800  # [s] preamble, sync word, length, me
 _2G4_SYMBOL_S = 2**12 / 203_125  # [s] spreading factor 12; source: SX1280 data sheet
 _2G4_S = time_on_air_s(24, 12, 125_000) / (2**12 / 125_000) * _2G4_SYMBOL_S
 _GFSK_DBM, _LR_FHSS_DBM, _2G4_DBM = -118.0, -134.0, -130.0
-"""Sensitivities of an SX1262 at 4.8 kbit/s, of LR-FHSS, and of an SX1280 with SF12 at 203 kHz. [dBm] Source: assumed, of
-the size of the data sheets' figures; a dB more or less changes no conclusion."""
+"""Sensitivities of an SX1262 at 4.8 kbit/s, of LR-FHSS, and of an SX1280 with SF12 at 203 kHz. [dBm] Source: assumed,
+of the size of the data sheets' figures; a dB more or less changes no conclusion."""
 _2G4_LOSS_DB = 20 * math.log10(2440 / 915)  # free space, against the paper's link
 
 
