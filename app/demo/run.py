@@ -264,8 +264,8 @@ def _demonstrate_cerpms(client: httpx.Client, out: Path, say: Say) -> tuple[list
     (folder / "radio-check.json").write_text(json.dumps(check, indent=2) + "\n")
     say(f"Radio check: at one transmission every {INTERVAL_S:g} s {check['read_probability']:.1%} of markers are read")
     say(f"{check['preview_m']:.0f} m ahead at 30 km/h. To reach 99 %: {check['recommendation']['sentence']}.")
-    say("Radio and check follow the rules of the United States (47 CFR 15.247), which do not apply in Germany: no")
-    say("settings that Waymark tries and that EU868 permits reach 99 %.")
+    say("Radio and check follow the rules of the United States (47 CFR 15.247), which do not apply in Germany: under")
+    say("EU868, the check recommends slots and polite spectrum access.")
     say("Simulating drives past them; uploading each drive as packets, poses and a camera frame ...")
     results: list[LaneResult] = []
     received: list[ReceivedPacket] = []

@@ -182,6 +182,7 @@ COLUMNS = (
     "number", "lon_deg", "lat_deg", "height_m", "side", "speed_limit", "speed_unit", "body_hex", "sequence_start",
     "interval_s", "jitter_share", "frequency_hz", "channels", "hopping", "spreading_factor", "bandwidth_hz",
     "coding_rate", "preamble_symbols", "explicit_header", "crc", "power_dbm", "lorawan",
+    "polite", "slotted", "place", "slot_guard_s",
 )  # fmt: skip
 KEY_COLUMN = "key_hex"
 
@@ -280,4 +281,8 @@ def _row(program: MarkerProgram) -> list[object]:
         str(radio.crc).lower(),
         f"{radio.power_dbm:g}",
         str(radio.lorawan).lower(),
+        str(radio.polite).lower(),
+        str(radio.slotted).lower(),
+        radio.place if radio.slotted else "",
+        f"{radio.slot_guard_s:g}" if radio.slotted else "",
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
@@ -40,10 +40,11 @@ from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import PlacedPosition
+from app.geodesy.frames import ecef_from_wgs84
 from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedCerpm, PlannedMarker
-from app.radio.settings import RadioSettings
+from app.radio.settings import RadioSettings, assign_places
 from app.registry import markers as cerpms
 from app.registry.bulk_load import Columns
 from app.registry.column_types import row_of
@@ -301,6 +302,17 @@ def _spec(
     return {"side": side, "speed_limit": limit, "dev_eui": dev_eui, "radio": asdict(radio)}
 
 
+def _placed_radios(radio: RadioSettings, markers: Sequence[PlannedMarker]) -> list[RadioSettings]:
+    """The radio of each marker of a plan: in slots with a place that no marker near it has."""
+    if radio.slots is None:
+        return [radio] * len(markers)
+    along = sorted(range(len(markers)), key=lambda k: markers[k].station_m)
+    lon_deg, lat_deg = (np.array([getattr(markers[k], name) for k in along]) for name in ("lon_deg", "lat_deg"))
+    places = assign_places(ecef_from_wgs84(lon_deg, lat_deg), radio.slots.capacity)
+    place_of = dict(zip(along, places.tolist(), strict=True))
+    return [replace(radio, place=place_of[k]) for k in range(len(markers))]
+
+
 # === The family of CERPMs: their numbers, the properties that they broadcast, and their radio.
 
 
@@ -394,11 +406,12 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
         return {int(row.digits) for row in known if row.agency_id == agency_id}
 
     def planned_rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
-        """One row for each CERPM."""
-        for marker in markers:
+        """One row for each CERPM; in slots each with its place."""
+        radios = _placed_radios(commitment.radio, markers)
+        for marker, radio in zip(markers, radios, strict=True):
             detail = marker.detail
             assert isinstance(detail, PlannedCerpm)
-            spec = _spec(detail.side.name.lower(), detail.speed_limit, commitment.radio)
+            spec = _spec(detail.side.name.lower(), detail.speed_limit, radio)
             columns = {"scheme": "cerpm", "digits": str(detail.number), "spec": spec}
             yield PlannedRow(marker.number, commitment.position(marker) | columns)
 

@@ -32,6 +32,7 @@ from app.radio.regulation import check_legal, check_transmitter, is_permitted
 from app.radio.settings import (
     BANDWIDTHS_HZ,
     DATA_RATES,
+    MAX_BATTERY_DAYS,
     SPREADING_FACTORS,
     Battery,
     RadioSettings,
@@ -163,7 +164,7 @@ def check_radio(plan: RadioPlan, *, recommend: bool = False) -> RadioCheck:
         *_lorawan_room(plan),
         _level(plan),
         _channels(plan),
-        _jitter(plan.radio),
+        _turns(plan.radio, max(road.markers_in_range)),
         _probability(plan, probability, success, max(road.markers_in_range)),
         _battery(plan, days),
     )
@@ -246,7 +247,19 @@ def _channels(plan: RadioPlan) -> RadioFinding:
     )
 
 
-def _jitter(settings: RadioSettings) -> RadioFinding:
+def _turns(settings: RadioSettings, in_range: int) -> RadioFinding:
+    """Whether markers collide at random, and not every time: by jitter, or by slots of their own."""
+    if settings.slots is not None:
+        return at_least(
+            "slots",
+            settings.slots.capacity,
+            in_range,
+            "slots",
+            "one marker in each slot of a channel",
+            f"{settings.slots.per_channel} of {1000 * settings.slots.slot_s:.1f} ms on each of {settings.channels} "
+            f"channels in {settings.interval_s:g} s, for {in_range} markers in range of a vehicle",
+            worst=Verdict.WARN,
+        )
     return at_least(
         "jitter",
         2 * settings.jitter_share * settings.interval_s,
@@ -264,7 +277,8 @@ def _probability(plan: RadioPlan, probability: float, success: float, in_range: 
         probability,
         plan.min_probability,
         "probability",
-        "pure ALOHA with capture; preview by AASHTO section 3.2.2 and the CERPM paper, section 5",
+        ("shadows by Gudmundson 1991, slots" if plan.radio.slotted else "pure ALOHA with capture")
+        + "; preview by AASHTO section 3.2.2 and the CERPM paper, section 5",
         f"that a marker is read before the vehicle is {plan.preview_m:.0f} m from it, at {plan.design_speed_m_s:g} m/s "
         f"with {in_range} markers in range; {success:.0%} of its packets are read there",
     )
@@ -277,7 +291,8 @@ def _battery(plan: RadioPlan, days: float) -> RadioFinding:
         plan.min_battery_days,
         "days",
         "CERPM paper, section 2.2; SX1276 data sheet, table 6",
-        f"{plan.battery.capacity_mah:g} mAh without being charged",
+        f"{plan.battery.capacity_mah:g} mAh "
+        + (f"and a solar cell of {plan.battery.solar_mw:g} mW" if plan.battery.solar_mw else "without being charged"),
         worst=Verdict.WARN,
     )
 
@@ -288,6 +303,7 @@ def _battery(plan: RadioPlan, days: float) -> RadioFinding:
 INTERVALS_S = tuple(float(f"{v:.2g}") for v in np.geomspace(0.1, 20.0, 16))  # [s] ratio of 1.42
 POWERS_DBM = (20.0, 17.0, 14.0, 11.0, 8.0)  # [dBm] halves of the SX1276's maximum
 MORE_CHANNELS = (2, 4, 8, 16, 32)  # up to four gateway chips
+_EU_CHANNELS = 10  # of 200 kHz in 863 to 865 MHz; source: EN 300 220-2 V3.2.1, table B.1, band K
 _WANTED = 8  # markers that are approached; bounds the time of the search
 
 
@@ -295,14 +311,15 @@ _WANTED = 8  # markers that are approached; bounds the time of the search
 class Recommendation:
     """The best lawful settings that were found."""
 
-    # those with the longest battery life that reach the required probability; if none does, those with the highest
-    # probability
+    # those with the longest battery life that reach the required probability, of equal ones the most probable; if none
+    # does, those with the highest probability
     radio: Annotated[RadioSettings | None, Field(description="Null where nothing is lawful.")]
     receiver_channels: int  # channels that the receiver must receive at the same time
     read_probability: float
     battery_days: float  # [day]
     reaches: Annotated[bool, Field(description="Whether the probability asked for is reached.")]
     sentence: str  # for people
+    law: tuple[RadioFinding, ...] = ()  # every limit of the region, with the settings' figure
 
 
 def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recommendation:
@@ -313,7 +330,8 @@ def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recomm
     plan : RadioPlan
         Its spreading factor, bandwidth, interval and power are varied; all other settings are kept.
     more_channels : bool
-        If one channel is not enough, spread fixed markers over 2, 4, 8, 16 or 32 channels, all received.
+        If one channel is not enough, spread fixed markers over 2, 4, 8, 16 or 32 channels, all received. In Europe, if
+        none of these are lawful and enough, let them send in slots on ten channels of band K, with polite access.
 
     Returns
     -------
@@ -340,25 +358,49 @@ def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recomm
         if found.reaches:
             return found
         best = max(best, found, key=lambda one: one.read_probability)
+    if plan.region is Region.EU868 and not plan.radio.lorawan:
+        best = max(best, _best(in_slots(plan), approaches), key=lambda one: one.read_probability)
     return best
 
 
+def in_slots(plan: RadioPlan) -> RadioPlan:
+    """A European plan with slots on the ten channels of 863 to 865 MHz, all received, and polite spectrum access."""
+    radio = replace(
+        plan.radio,
+        frequency_hz=863_100_000,
+        bandwidth_hz=BANDWIDTHS_HZ[0],
+        interval_s=INTERVALS_S[-1],
+        jitter_share=0.0,
+        channels=_EU_CHANNELS,
+        hopping=True,
+        polite=True,
+        slotted=True,
+    )
+    receiver = replace(plan.receiver, channels=max(_EU_CHANNELS, plan.receiver.channels))
+    return replace(plan, radio=radio, receiver=receiver)
+
+
 def _best(plan: RadioPlan, approaches_by_link: _ApproachesByLink) -> Recommendation:
-    reaching: tuple[float, RadioSettings, float] | None = None
+    reaching: tuple[float, float, RadioSettings] | None = None
     likeliest: tuple[float, RadioSettings] | None = None
     for first in _modulations(plan):
         approaches = approaches_by_link.find(first)
-        for settings in _intervals(first, plan) if approaches else ():
+        intervals = list(_intervals(first, plan)) if approaches else []
+        for settings in reversed(intervals) if first.slotted else intervals:
+            if settings.slotted:
+                approaches = approaches_by_link.find(settings)
             air = Air(settings, plan.link, plan.receiver)
             probability = min(read_probability(one, plan.design_speed_m_s, air) for one in approaches)
             if likeliest is None or probability > likeliest[0]:
                 likeliest = probability, settings
             if probability >= plan.min_probability:
                 days = battery_life_days(settings, plan.battery)
-                if reaching is None or days > reaching[0]:
-                    reaching = days, settings, probability
+                if reaching is None or (days, probability) > reaching[:2]:
+                    reaching = days, probability, settings
+                if settings.slotted and days < MAX_BATTERY_DAYS:
+                    break  # with shorter intervals the battery lasts less
     if reaching is not None:
-        return _recommendation(plan, reaching[1], reaching[2])
+        return _recommendation(plan, reaching[2], reaching[1])
     return _recommendation(plan, likeliest[1], likeliest[0]) if likeliest else _recommendation(plan, None, 0.0)
 
 
@@ -394,16 +436,17 @@ def _intervals(first: RadioSettings, plan: RadioPlan) -> Iterator[RadioSettings]
 
 
 class _ApproachesByLink:
-    """Approaches of a plan's markers, each computed once: they depend on sensitivity and power, not on channels."""
+    """Approaches of a plan's markers, each computed once: they depend on sensitivity and power, not on channels; in
+    slots also on who shares one."""
 
     def __init__(self, plan: RadioPlan) -> None:
         self._plan = plan
-        self._found: dict[tuple[float, float], list[Approach]] = {}
+        self._found: dict[tuple[float, float, int], list[Approach]] = {}
 
     def find(self, settings: RadioSettings) -> list[Approach]:
         """Approaches with these settings; none where more markers are in range than a check allows."""
         plan = replace(self._plan, radio=settings)
-        key = plan.air.threshold_dbm, settings.power_dbm
+        key = plan.air.threshold_dbm, settings.power_dbm, settings.slots.capacity if settings.slots else 0
         if key not in self._found:
             try:
                 self._found[key] = _approaches(plan)
@@ -437,6 +480,9 @@ def _recommendation(plan: RadioPlan, settings: RadioSettings | None, probability
         f"SF{settings.spreading_factor} at {settings.bandwidth_hz / 1000:g} kHz and {settings.power_dbm:g} dBm, every "
         f"{settings.interval_s:g} s on {channels}: {probability:.1%} of markers are read {plan.preview_m:.0f} m ahead"
     )
+    if settings.slotted:
+        sentence += "; in slots by satellite time" + (", with polite spectrum access" if settings.polite else "")
     if not reaches:
         sentence += f"; no lawful settings tried reach {plan.min_probability:.1%}"
-    return Recommendation(settings, receives, probability, days, reaches, sentence)
+    law = check_legal(settings, plan.region)
+    return Recommendation(settings, receives, probability, days, reaches, sentence, law)

@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from pydantic import Field, GetPydanticSchema
 
 from app.errors import InvalidParameter
@@ -190,12 +191,20 @@ def packet_success(
 ) -> Floats:
     """Share of a marker's packets that are strong enough, on a received channel, and not destroyed.
 
-    Levels have shape (...), harmful others (..., Q).
+    Levels have shape (...), harmful others (..., Q); in slots only those that share the marker's slot and channel, each
+    of which destroys every packet.
     """
     strong_enough = link.share_above(wanted_dbm, receiver.threshold_dbm(settings))
+    return np.asarray(strong_enough * _clear_share(harmful, settings, receiver))
+
+
+def _clear_share(harmful: npt.ArrayLike, settings: RadioSettings, receiver: Receiver) -> Floats:
+    """Share of the strong packets that are on a received channel and not destroyed, shape (..., Q) to (...)."""
     channel_share = min(1.0, receiver.channels / settings.channels)
+    if settings.slotted:
+        return np.asarray(channel_share * np.exp(-np.asarray(harmful, float)).mean(-1))
     clear = aloha_success(harmful, settings.time_on_air_s, settings.interval_s, settings.channels)
-    return np.asarray(strong_enough * channel_share * clear.mean(-1))
+    return np.asarray(channel_share * clear.mean(-1))
 
 
 # === Reception at each point of a road, and the probability that a marker is read in time.
@@ -336,6 +345,8 @@ def reception_at(markers: RoadMarkers, station_m: float, air: Air) -> StationRec
     near = near[np.argsort(distance_m[near], kind="stable")]
     level = air.level_dbm(distance_m[near])
     harmful = harmful_to_each(level, air.threshold_dbm, air.link, air.receiver)
+    if air.settings.slots is not None:  # the nearest ones have other places
+        harmful = np.maximum(harmful - air.settings.slots.capacity, 0.0) / air.settings.slots.capacity
     success = packet_success(level, harmful, air.settings, air.link, air.receiver)
     in_range = level >= air.threshold_dbm
     return StationReception(station_m, near[in_range], distance_m[near[in_range]], level[in_range], success[in_range])
@@ -388,6 +399,8 @@ def approach(markers: RoadMarkers, index: int, nearest_m: float, air: Air) -> Ap
     away_m = markers.chainage_m - markers.chainage_m[index]
     others = (away_m >= -air.reach_m - air.harm_m) & (away_m <= air.harm_m - nearest_m)
     others[index] = False
+    if air.settings.slots is not None:
+        others &= _share_slot(markers, index, air.settings.slots.capacity)
     stations_m = markers.chainage_m[index] - ahead_m
     neighbours = RoadMarkers(markers.chainage_m[others], markers.offset_m[others]) if others.any() else None
     level = air.level_dbm(np.hypot(ahead_m, markers.offset_m[index]))
@@ -395,6 +408,13 @@ def approach(markers: RoadMarkers, index: int, nearest_m: float, air: Air) -> Ap
         return Approach(ahead_m, level, np.zeros((len(ahead_m), 1)))
     other_levels = air.level_dbm(neighbours.distances_m(stations_m))
     return Approach(ahead_m, level, harmful_others(level, other_levels, air.threshold_dbm, air.link, air.receiver))
+
+
+def _share_slot(markers: RoadMarkers, index: int, capacity: int) -> npt.NDArray[np.bool_]:
+    """Which markers have the place of one, if places are assigned along the road, over all its lanes; shape (M,)."""
+    place = np.empty(len(markers.chainage_m), int)
+    place[np.argsort(markers.chainage_m, kind="stable")] = np.arange(len(place))
+    return np.asarray((place - place[index]) % capacity == 0)
 
 
 def read_probability(reception: Approach, speed_m_s: float, air: Air) -> float:
@@ -415,7 +435,9 @@ def read_probability(reception: Approach, speed_m_s: float, air: Air) -> float:
     Notes
     -----
     The marker sends every interval from a random phase; the result is averaged over 32 phases. Packets are assumed to
-    fade and collide independently; for collisions jitter makes this nearly true.
+    fade and collide independently; for collisions jitter makes this nearly true. In slots there are hardly any
+    collisions, so that what is lost is lost by fading, and then it matters that consecutive packets meet the same
+    shadows (`_miss_in_shadows`).
     """
     check_between("design_speed_m_s", speed_m_s, 0.5, 70.0, "m/s")
     if len(reception.ahead_m) == 0:
@@ -427,5 +449,37 @@ def read_probability(reception: Approach, speed_m_s: float, air: Air) -> float:
     count = math.ceil(stretch_m / (each * stride_m))
     phases = (np.arange(_PHASES) + 0.5) / _PHASES
     sent_m = reception.ahead_m[0] + each * stride_m * (phases[:, None] + np.arange(count))
+    if air.settings.slotted:
+        return 1 - _miss_in_shadows(reception, sent_m, each, air)
     missed = 1 - np.interp(sent_m, reception.ahead_m, success, right=0.0)
     return float(1 - (missed**each).prod(axis=1).mean())
+
+
+SHADOW_M = 25.0  # [m] length over which shadows are alike; source: as `simulation.radio.link.Radio`
+PACKET_FADING_DB = 2.0  # [dB] from packet to packet, besides the shadows; source: as `simulation.radio.link.Radio`
+_SHADOWS = np.linspace(-4.0, 4.0, 65)  # standard deviations of a shadow's depth
+
+
+def _miss_in_shadows(reception: Approach, sent_m: Floats, each: int, air: Air) -> float:
+    """Probability that all packets sent at distances of shape (phases, K), rising, are missed.
+
+    Notes
+    -----
+    The depth of the shadow is a Gauss-Markov process along the way with the link's fading as standard deviation
+    (Gudmundson, Electronics Letters 27 (1991), 2145), on a grid; each packet also fades by itself. A forward recursion
+    from the farthest packet to the nearest: probability of each depth and of no packet read so far.
+    """
+    if np.size(sent_m) == 0:
+        return 1.0
+    keep = math.exp(-(sent_m[0, 1] - sent_m[0, 0]) / SHADOW_M) if sent_m.shape[1] > 1 else 0.0
+    step = np.exp(-((_SHADOWS - keep * _SHADOWS[:, None]) ** 2) / (2 * max(1 - keep**2, 1e-2)))
+    step /= step.sum(axis=1, keepdims=True)
+    clear = _clear_share(reception.harmful, air.settings, air.receiver)
+    missed = np.broadcast_to(np.exp(-(_SHADOWS**2) / 2), (len(sent_m), len(_SHADOWS)))
+    missed = missed / missed.sum(axis=1, keepdims=True)
+    for k in range(sent_m.shape[1])[::-1]:
+        level = np.interp(sent_m[:, k], reception.ahead_m, reception.level_dbm)[:, None] + _SHADOWS * air.link.fading_db
+        strong = scipy.special.ndtr((level - air.threshold_dbm) / PACKET_FADING_DB)
+        read = strong * np.interp(sent_m[:, k], reception.ahead_m, clear, right=0.0)[:, None]
+        missed = (missed if k == sent_m.shape[1] - 1 else missed @ step) * (1 - read) ** each
+    return float(missed.sum(axis=1).mean())

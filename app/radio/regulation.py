@@ -1,7 +1,8 @@
 """Checks of a marker's radio settings: the regulation of a region, and the duty cycle of the transmitter itself.
 
-Sources: 47 CFR 15.247 and 15.249 (United States, 902-928 MHz); ERC Recommendation 70-03 annex 1 and ETSI EN 300 220-2
-V3.2.1 table B.1 (Europe, 863-870 MHz, without listen before talk). Figures here are calculated from settings; for
+Sources: 47 CFR 15.247 and 15.249 (United States, 902-928 MHz); ERC Recommendation 70-03 annex 1, ETSI EN 300 220-2
+V3.2.1 table B.1, and for polite spectrum access (listen before talk and adaptive frequency agility) EN 300 220-1 V3.1.1
+clause 5.21 (Europe, 863-870 MHz). Figures here are calculated from settings; for
 certification they are measured on the device.
 """
 
@@ -11,7 +12,7 @@ import math
 from dataclasses import dataclass
 
 from app.markers.reading import RadioFinding, Verdict, at_least, at_most
-from app.radio.settings import CONTINUOUS_POWER_DBM, FULL_POWER_DUTY_CYCLE, RadioSettings, Region
+from app.radio.settings import CHANNEL_STEP, CONTINUOUS_POWER_DBM, FULL_POWER_DUTY_CYCLE, RadioSettings, Region
 
 US_BAND_HZ = (902_000_000, 928_000_000)  # [Hz] source: 47 CFR 15.247(a)
 DWELL_S = 0.4  # [s] source: 47 CFR 15.247(a)(1)(i)
@@ -84,6 +85,14 @@ EU_SUB_BANDS = (
     SubBand(869_700_000, 870_000_000, 0.01, 14.0),
 )
 """Source: EN 300 220-2 V3.2.1, table B.1, bands K, L, M, N, P and Q."""
+POLITE_ON_S = 100.0  # [s] in an hour on any 200 kHz; source: EN 300 220-1 V3.1.1, clause 5.21
+POLITE_PACKET_S = 1.0  # [s] longest transmission; source: EN 300 220-1 V3.1.1, clause 5.21
+POLITE_PAUSE_S = 0.1  # [s] between transmissions on a channel; source: EN 300 220-1 V3.1.1, clause 5.21
+POLITE_SPECTRUM_HZ = 200_000  # [Hz] source: EN 300 220-1 V3.1.1, clause 5.21
+POLITE_LISTEN_S = 160e-6  # [s] shortest assessment of a channel; source: EN 300 220-1 V3.1.1, clause 5.21
+# [dBm, dB] level that a channel in use exceeds, below 100 mW: 15 dB over Sp = 10 log(kHz) - 117 dBm; source: EN
+# 300 220-1 V3.1.1, clause 5.21, cited by Saelens et al., EURASIP JWCN 2019, 219, table 11
+_SP_DBM, _OVER_SP_DB = -117.0, 15.0
 _EU_DENSITY_HZ = 100_000  # [Hz] source: EN 300 220-2 V3.2.1, table B.1, band L
 
 
@@ -281,19 +290,49 @@ def _check_eu(settings: RadioSettings) -> tuple[RadioFinding, ...]:
         return (RadioFinding("band", off_hz / 1e6, "<=", 0.0, "MHz", source, Verdict.FAIL, sentence),)
     name = f"{band.low_hz / 1e6:g} to {band.high_hz / 1e6:g} MHz"
     density = (_eu_density(settings, band, name),) if math.isfinite(band.density_dbm) else ()
+    access = _polite(settings) if settings.polite else (_duty_cycle(settings, band, name, source),)
     return (
         _within(settings, band.low_hz, band.high_hz, source),
-        at_most(
-            "duty-cycle",
-            settings.time_on_air_s / settings.interval_s,
-            band.duty_cycle,
-            "of an hour",
-            source,
-            f"of one marker in {name}, however many channels it uses there",
-        ),
+        *access,
         at_most("power", settings.eirp_dbm - _ERP_DB, band.erp_dbm, "dBm ERP", source, f"radiated in {name}"),
         *density,
     )
+
+
+def _duty_cycle(settings: RadioSettings, band: SubBand, name: str, source: str) -> RadioFinding:
+    return at_most(
+        "duty-cycle",
+        settings.time_on_air_s / settings.interval_s,
+        band.duty_cycle,
+        "of an hour",
+        source,
+        f"of one marker in {name}, however many channels it uses there",
+    )
+
+
+def polite_threshold_dbm(bandwidth_hz: float) -> float:
+    """Level above which a polite radio counts a channel as in use, for less than 100 mW. [dBm]"""
+    return _SP_DBM + _OVER_SP_DB + 10 * math.log10(bandwidth_hz / 1000)
+
+
+def _polite(settings: RadioSettings) -> tuple[RadioFinding, ...]:
+    """Limits of polite spectrum access with frequency agility, which stand in place of a duty cycle."""
+    source = "EN 300 220-1 V3.1.1, clause 5.21; EN 300 220-2 V3.2.1, table B.1"
+    narrow = max(1.0, POLITE_SPECTRUM_HZ / (CHANNEL_STEP * settings.bandwidth_hz))  # channels in 200 kHz
+    on_s = 3600 / settings.interval_s * settings.time_on_air_s * narrow / settings.channels
+    threshold_dbm = polite_threshold_dbm(settings.bandwidth_hz)
+    return (
+        at_most(
+            "polite-on-time", on_s, POLITE_ON_S, "s in an hour", source,
+            f"of one marker on any 200 kHz, hopping evenly over {settings.channels} channels; it listens for "
+            f"{1e6 * POLITE_LISTEN_S:g} us or more, and hops on if a channel is above {threshold_dbm:.0f} dBm",
+        ),
+        at_most("polite-packet", settings.time_on_air_s, POLITE_PACKET_S, "s", source, "time on air of a packet"),
+        at_least(
+            "polite-pause", settings.interval_s * (1 - settings.jitter_share * (not settings.slotted))
+            - settings.time_on_air_s, POLITE_PAUSE_S, "s", source, "shortest, between the packets of one marker",
+        ),
+    )  # fmt: skip
 
 
 def _eu_density(settings: RadioSettings, band: SubBand, name: str) -> RadioFinding:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+import zlib
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated
 
+import numpy as np
+import numpy.typing as npt
+import scipy
 from pydantic import Field, with_config
 
 from app.errors import InvalidParameter
 from app.inputs import INPUT, Flag, Number, Whole
 from app.markers.cerpm import MESSAGE_BYTES
+from app.values import Ints
 
 # === Time on air of LoRa packets.
 
@@ -164,6 +169,93 @@ DATA_RATES: dict[Region, tuple[DataRate, ...]] = {
 2.3 (the same in RP002-1.0.4)."""
 
 
+# === Slots: which marker sends when, and on which channel, where all have the time of satellites.
+
+
+SLOT_GUARD_S = 0.004  # [s] between packets in slots, for errors of clocks up to half of it
+MAX_PLACES = 1_000_000  # of a frame: a slot of 1 ms on each of 128 channels, for 8 s
+_CHANNEL_SALT = b"waymark slot"
+_MIX = 2654435761  # source: Knuth, TAOCP 3, 6.4; CRC alone is linear, so that two slots would meet always or never
+_PLACES_AT_ONCE = 1000  # markers whose neighbours are looked up together; bounds memory
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """The frame that markers share: slots in time on channels. A slot on a channel is a place."""
+
+    frame_s: float  # [s] in which each marker sends once; frames are counted from the GPS epoch
+    slot_s: float  # [s] a packet and its guard time
+    channels: int
+
+    @property
+    def per_channel(self) -> int:
+        """Slots of a frame on one channel."""
+        return math.floor(self.frame_s / self.slot_s + 1e-9)
+
+    @property
+    def capacity(self) -> int:
+        """Places of a frame: markers that never send at the same time on the same channel."""
+        return self.per_channel * self.channels
+
+    def at(self, place: npt.ArrayLike, frame: npt.ArrayLike) -> tuple[Ints, Ints]:
+        """Slot and channel of places in frames; the arguments are broadcast against each other.
+
+        Parameters
+        ----------
+        place : array_like of int
+            0 or more; modulo `capacity`.
+        frame : array_like of int
+            Time since the GPS epoch over `frame_s`, rounded down; modulo 2^32.
+
+        Notes
+        -----
+        Slot ``s = place mod per_channel``, channel ``(place // per_channel + h) mod channels`` with ``h = (2654435761
+        CRC-32("waymark slot" || frame || s) mod 2^32) >> 16``, four bytes each, big endian. Places of one slot are on
+        different channels in every frame; those of neighbouring slots, which overlap if clocks are wrong, are on one
+        channel in one of `channels` frames only; and over an hour each place uses all channels alike.
+        """
+        places, frames = np.broadcast_arrays(np.asarray(place, np.int64), np.asarray(frame, np.int64) % 2**32)
+        places = places % self.capacity
+        slot = places % self.per_channel
+        pairs, which = np.unique(np.stack((frames.ravel(), slot.ravel()), 1), axis=0, return_inverse=True)
+        mixed = [zlib.crc32(_CHANNEL_SALT + f.to_bytes(4) + s.to_bytes(4)) * _MIX % 2**32 for f, s in pairs.tolist()]
+        hops = [one >> 16 for one in mixed]
+        hop = np.array(hops, np.int64)[which.ravel()].reshape(slot.shape)
+        return slot, (places // self.per_channel + hop) % self.channels
+
+
+def assign_places(points_m: npt.ArrayLike, capacity: int) -> Ints:
+    """Places of a frame for markers, so that those with the same place are far apart.
+
+    Parameters
+    ----------
+    points_m : array_like, shape (N, D)
+        Positions in any Cartesian frame. [m]
+    capacity : int
+        Places of a frame.
+
+    Returns
+    -------
+    ndarray of int, shape (N,)
+        0 to capacity - 1. Each marker in turn gets a place that none of its 2 `capacity` nearest markers has yet or, if
+        they have all of them, the place whose nearest user is the farthest.
+    """
+    points = np.asarray(points_m, float)
+    place = np.full(len(points), -1, np.int64)
+    if len(points) == 0:
+        return place
+    count = min(2 * capacity, len(points))  # along a road, half of them have their places already
+    tree = scipy.spatial.cKDTree(points)
+    for start in range(0, len(points), _PLACES_AT_ONCE):
+        _distance, near = tree.query(points[start : start + _PLACES_AT_ONCE], k=[*range(1, count + 1)])
+        for k, row in enumerate(np.atleast_2d(near), start):
+            rank = np.full(capacity, len(points))  # of the nearest user of each place
+            taken = place[row][::-1]  # the nearest ones last, so that they count
+            rank[taken[taken >= 0]] = np.arange(len(row))[::-1][taken >= 0]
+            place[k] = rank.argmax()
+    return place
+
+
 # === Settings of a marker's radio.
 
 
@@ -206,6 +298,27 @@ class RadioSettings:
     explicit_header: Annotated[Flag, Field(description="Whether packets have a header.")] = True
     crc: Annotated[Flag, Field(description="Whether packets have a checksum of the radio.")] = True
     lorawan: Annotated[Flag, Field(description="The message travels in a LoRaWAN frame.")] = False
+    polite: Annotated[
+        Flag,
+        Field(
+            description="It listens before each packet, and hops on where the channel is in use (EN 300 220-1, clause "
+            "5.21: polite spectrum access with adaptive frequency agility); needs hopping."
+        ),
+    ] = False
+    slotted: Annotated[
+        Flag,
+        Field(
+            description="Markers send in slots, each in its `place`, by the time of a satellite receiver in each, "
+            "without jitter; on several channels it needs hopping."
+        ),
+    ] = False
+    place: Annotated[
+        Whole,
+        Field(description="Of this marker in a frame of slots; markers within twice the range need different ones."),
+    ] = 0
+    slot_guard_s: Annotated[
+        Number, Field(description="Between packets in slots, 0.001 to 1: twice the largest error of a clock. [s]")
+    ] = SLOT_GUARD_S
 
     def __post_init__(self) -> None:
         """Raises InvalidParameter if a value is outside its limits, or a packet longer than the shortest interval."""
@@ -222,6 +335,16 @@ class RadioSettings:
             raise InvalidParameter(
                 "a radio cannot hop on one channel", field="channels", limit="2 to 128 with hopping", cure="name more"
             )
+        check_whole("place", self.place, 0, MAX_PLACES, "")
+        check_between("slot_guard_s", self.slot_guard_s, 0.001, 1.0, "s")
+        for name, wanted in (("polite", self.polite), ("slotted", self.slotted and self.channels > 1)):
+            if wanted and not self.hopping:
+                raise InvalidParameter(
+                    f"a {name} radio on fixed channels",
+                    field="hopping",
+                    limit=f"true with {name}",
+                    cure="let it hop over two channels or more",
+                )
         if self.lorawan and not self.explicit_header:
             raise InvalidParameter(
                 "LoRaWAN uplinks have a header",
@@ -230,7 +353,15 @@ class RadioSettings:
                 cure="keep the header, or send without LoRaWAN",
             )
         shortest_s = self.interval_s * (1 - self.jitter_share)
-        if self.time_on_air_s > shortest_s:
+        if self.slotted:
+            if self.slots is None or self.slots.per_channel < 1:
+                raise InvalidParameter(
+                    f"no slot of {self.time_on_air_s + self.slot_guard_s:.3f} s fits in the interval",
+                    field="interval_s",
+                    limit=f"{self.time_on_air_s + self.slot_guard_s:.3f} s or more with these slots",
+                    cure="send less often, or with a lower spreading factor or a wider band",
+                )
+        elif self.time_on_air_s > shortest_s:
             raise InvalidParameter(
                 f"a packet lasts {self.time_on_air_s:.3f} s, longer than the shortest interval",
                 field="interval_s",
@@ -263,6 +394,13 @@ class RadioSettings:
         )
 
     @property
+    def slots(self) -> Slots | None:
+        """The frame of slots; None without slots."""
+        if not self.slotted:
+            return None
+        return Slots(self.interval_s, self.time_on_air_s + self.slot_guard_s, self.channels)
+
+    @property
     def eirp_dbm(self) -> float:
         """Radiated power, relative to an isotropic antenna. [dBm]"""
         return self.power_dbm + self.antenna_gain_dbi
@@ -272,12 +410,23 @@ class RadioSettings:
 
 
 CAPACITY_MAH = 1000.0  # [mAh] at 3.7 V; source: CERPM paper, section 2.2
+MAX_BATTERY_DAYS = 3650.0  # [day] of a charged battery: ten years; source: assumed, age ends it then
+_VOLTS = 3.7  # [V] source: CERPM paper, section 2.2
 _TRANSMIT_MA = ((7.0, 20.0), (13.0, 29.0), (17.0, 87.0), (20.0, 120.0))  # [dBm, mA] source: SX1276 data sheet, table 6
+_LISTEN_MA, _LISTEN_S = 12.0, 0.005  # [mA, s] before a polite packet; source: SX1276 data sheet, table 6, and assumed
+# [mA, s, s] of a satellite receiver: current, duration of a fix, and time between fixes, in which an oscillator of
+# 0.5 ppm drifts by 0.9 ms; source: assumed, of the size of data sheets
+_FIX_MA, _FIX_S, FIX_EVERY_S = 25.0, 3.0, 1800.0
+SUN_H = (0.7, 1.4, 2.6, 4.1, 5.0, 5.4, 5.3, 4.5, 3.1, 1.7, 0.9, 0.5)
+"""Sun on a horizontal square metre in a day of each month, at 50 degrees north in Central Europe. [h at 1,000 W/m2]
+Source: assumed, of the size of the monthly means that PVGIS shows for Frankfurt; 1,070 hours in a year."""
+_CHARGED_SHARE = 0.5  # of a cell's rated energy; source: assumed: dirt and shade of traffic 0.7, charging 0.7
+_FIRST_MONTH = 9  # October: a full battery meets the dark half of the year first
 
 
 @dataclass(frozen=True, slots=True)
 class Battery:
-    """The marker's battery and its loads."""
+    """The marker's battery, its loads, and the solar cell that charges it."""
 
     capacity_mah: Annotated[Number, Field(description="10 to 1,000,000. [mAh]")] = CAPACITY_MAH
     usable_share: Annotated[  # source: assumed, no measurement kept
@@ -297,6 +446,20 @@ class Battery:
     transmit_ma: Annotated[
         Number | None, Field(description="While it sends, 1 to 1,000; by the power and the SX1276's data sheet. [mA]")
     ] = None
+    solar_mw: Annotated[
+        Number,
+        Field(
+            description="Rated power of a solar cell in the marker's top, at 1,000 W/m2, 0 (none) to 100,000; half of "
+            "its energy charges the battery. [mW]"
+        ),
+    ] = 0.0
+    winter_sun_h: Annotated[
+        Number,
+        Field(
+            description="Sun on the horizontal in a day of December, 0 to 8, which moves the other months as much: 0.5 "
+            "in Central Europe, 0.2 at 59 and 2 at 40 degrees north. [h at 1,000 W/m2]"
+        ),
+    ] = SUN_H[11]
 
     def __post_init__(self) -> None:
         check_between("battery.capacity_mah", self.capacity_mah, 10.0, 1e6, "mAh")
@@ -306,19 +469,51 @@ class Battery:
         check_between("battery.awake_s", self.awake_s, 0.0, 10.0, "s")
         if self.transmit_ma is not None:
             check_between("battery.transmit_ma", self.transmit_ma, 1.0, 1000.0, "mA")
+        check_between("battery.solar_mw", self.solar_mw, 0.0, 1e5, "mW")
+        check_between("battery.winter_sun_h", self.winter_sun_h, 0.0, 8.0, "h")
+
+    def charge_mw(self, month: int) -> float:
+        """Power that charges the battery, mean of a day in a month from 0, January. [mW]"""
+        sun_h = max(SUN_H[month] + self.winter_sun_h - SUN_H[11], 0.0)
+        return self.solar_mw * _CHARGED_SHARE * sun_h / 24
 
 
 def mean_current_ma(settings: RadioSettings, battery: Battery) -> float:
-    """Average supply current of a marker: asleep, and for each packet awake and sending. [mA]"""
+    """Average supply current of a marker: asleep, and for each packet awake, listening if it is polite, and sending; in
+    slots also of its satellite receiver. [mA]"""
     sending_ma = transmit_current_ma(settings.power_dbm) if battery.transmit_ma is None else battery.transmit_ma
     airtime_s = settings.time_on_air_s
     packet_mas = airtime_s * sending_ma + (airtime_s + battery.awake_s) * battery.awake_ma
-    return battery.sleep_ma + packet_mas / settings.interval_s
+    packet_mas += _LISTEN_S * (_LISTEN_MA + battery.awake_ma) * settings.polite
+    timing_ma = _FIX_S * _FIX_MA / FIX_EVERY_S * settings.slotted
+    return battery.sleep_ma + packet_mas / settings.interval_s + timing_ma
 
 
 def battery_life_days(settings: RadioSettings, battery: Battery) -> float:
-    """Battery life without charging. [day]"""
-    return battery.capacity_mah * battery.usable_share / max(mean_current_ma(settings, battery), 1e-9) / 24
+    """Battery life; of a charged battery at most ten years. [day]"""
+    return life_days(mean_current_ma(settings, battery), battery)
+
+
+def life_days(current_ma: float, battery: Battery) -> float:
+    """Time until a full battery is empty, from October on. [day]
+
+    Notes
+    -----
+    The charge rises and falls evenly within a month, by the cell's mean power and the load, and stays below the usable
+    capacity.
+    """
+    usable_mwh = battery.capacity_mah * battery.usable_share * _VOLTS
+    load_mw = max(current_ma, 1e-9) * _VOLTS
+    if battery.solar_mw == 0.0:
+        return usable_mwh / load_mw / 24
+    month_days = 365.0 / 12
+    left_mwh = usable_mwh
+    for k in range(round(MAX_BATTERY_DAYS / month_days)):
+        gain_mw = battery.charge_mw((_FIRST_MONTH + k) % 12) - load_mw
+        if left_mwh + 24 * month_days * gain_mw <= 0.0:
+            return k * month_days + left_mwh / (-24 * gain_mw)
+        left_mwh = min(left_mwh + 24 * month_days * gain_mw, usable_mwh)
+    return MAX_BATTERY_DAYS
 
 
 def transmit_current_ma(power_dbm: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +11,28 @@ import pytest
 from app.errors import InvalidParameter
 from app.markers.reading import RadioFinding, Verdict
 from app.planning import radio_checks
-from app.planning.radio_checks import EvenRoad, PreviewRule, RadioCheck, RadioPlan, check_radio, recommend_settings
+from app.planning.radio_checks import (
+    EvenRoad,
+    PreviewRule,
+    RadioCheck,
+    RadioPlan,
+    check_radio,
+    in_slots,
+    recommend_settings,
+)
 from app.radio.link import LinkModel
 from app.radio.reception import Air, Approach, Receiver, RoadMarkers, approach
-from app.radio.regulation import is_permitted
-from app.radio.settings import Battery, RadioSettings, Region, battery_life_days, mean_current_ma, transmit_current_ma
+from app.radio.regulation import check_legal, is_permitted
+from app.radio.settings import (
+    MAX_BATTERY_DAYS,
+    Battery,
+    RadioSettings,
+    Region,
+    battery_life_days,
+    mean_current_ma,
+    transmit_current_ma,
+)
+from benchmarks.cerpm.europe import Design, share_in_time
 
 TEN_A_SIDE = RoadMarkers(np.repeat(np.arange(10) * 12.192, 2), np.tile([1.8, -1.8], 10))
 PAPERS_RADIO = RadioSettings(bandwidth_hz=125_000, interval_s=2.0)
@@ -138,6 +156,8 @@ def test_plans_outside_their_limits_are_refused(values: dict[str, float], field:
         (lambda: Battery(capacity_mah=0.0), "battery.capacity_mah"),
         (lambda: Battery(usable_share=1.1), "battery.usable_share"),
         (lambda: Battery(sleep_ma=-1.0), "battery.sleep_ma"),
+        (lambda: Battery(solar_mw=-1.0), "battery.solar_mw"),
+        (lambda: Battery(winter_sun_h=9.0), "battery.winter_sun_h"),
     ],
 )
 def test_rules_and_batteries_outside_their_limits_are_refused(make: object, field: str) -> None:
@@ -161,6 +181,36 @@ def test_a_battery_lasts_by_what_is_drawn() -> None:
 @pytest.mark.parametrize(("power_dbm", "current_ma"), [(20, 120), (18, 120), (17, 87), (13, 29), (7, 20), (-4, 20)])
 def test_power_costs_what_the_data_sheet_says(power_dbm: float, current_ma: float) -> None:
     assert transmit_current_ma(power_dbm) == current_ma
+
+
+def test_a_solar_cell_carries_a_marker_through_the_winter_or_not() -> None:
+    settings, bare = RadioSettings(interval_s=20.0), Battery(sleep_ma=0.1)
+    load_mw = 3.7 * mean_current_ma(settings, bare)
+    without = battery_life_days(settings, bare)
+    assert without == pytest.approx(800 * 3.7 / load_mw / 24)
+    # half of the rated energy of 0.5 h of sun a day carries it in December
+    enough = load_mw * 24 / 0.5 / 0.5
+    assert battery_life_days(settings, replace(bare, solar_mw=1.01 * enough)) == MAX_BATTERY_DAYS
+    little = [battery_life_days(settings, replace(bare, solar_mw=share * enough)) for share in (0.05, 0.2, 0.5)]
+    assert without < little[0] < little[1] <= little[2]
+    # a battery of a few days is empty in the first month in which the sun is too weak
+    small = replace(bare, capacity_mah=10.0, solar_mw=0.9 * enough)
+    days = battery_life_days(settings, small)
+    assert 61 < days < 92  # from October on: in December
+    dark = replace(small, winter_sun_h=0.0, solar_mw=1.01 * enough)
+    assert battery_life_days(settings, dark) < 92
+    assert [round(dark.charge_mw(month) / dark.solar_mw * 48, 2) for month in (0, 5, 11)] == [0.2, 4.9, 0.0]
+
+
+def test_listening_and_the_time_of_satellites_cost_current() -> None:
+    slotted = in_slots(RadioPlan(EUROPE, region=Region.EU868)).radio
+    battery = Battery()
+    untimed = replace(slotted, slotted=False)
+    deaf = replace(untimed, polite=False)
+    timing_ma = mean_current_ma(slotted, battery) - mean_current_ma(untimed, battery)
+    assert timing_ma == pytest.approx(3.0 * 25.0 / 1800.0)
+    listening_ma = mean_current_ma(untimed, battery) - mean_current_ma(deaf, battery)
+    assert listening_ma == pytest.approx(0.005 * (12.0 + 40.0) / slotted.interval_s)
 
 
 # --- recommendation -----------------------------------------------------------------------------------------------
@@ -216,14 +266,73 @@ def test_more_markers_than_a_check_takes_are_refused_and_not_recommended() -> No
 
 
 def test_what_cannot_be_reached_lawfully_is_said() -> None:
-    found = recommend_settings(RadioPlan(EUROPE, region=Region.EU868))
+    found = recommend_settings(RadioPlan(EUROPE, region=Region.EU868, design_speed_m_s=25.0))
     assert not found.reaches
     assert found.radio is not None
     assert is_permitted(found.radio, Region.EU868)
     assert found.read_probability < 0.99
-    nowhere = recommend_settings(RadioPlan(RadioSettings(), region=Region.EU868))
+    assert "no lawful settings tried reach 99.0%" in found.sentence
+    alone = recommend_settings(RadioPlan(EUROPE, region=Region.EU868), more_channels=False)
+    assert not alone.reaches
+    nowhere = recommend_settings(RadioPlan(RadioSettings(), region=Region.EU868), more_channels=False)
     assert nowhere.radio is None
+    assert nowhere.law == ()
     assert "no settings are lawful" in nowhere.sentence
+
+
+@pytest.mark.parametrize("frequency_hz", [868_100_000, 915_000_000])
+def test_in_europe_slots_on_polite_channels_are_recommended(frequency_hz: int) -> None:
+    plan = RadioPlan(replace(EUROPE, frequency_hz=frequency_hz), region=Region.EU868)
+    found = recommend_settings(plan)
+    assert found.reaches
+    assert found.radio is not None
+    assert found.radio.polite
+    assert found.radio.slotted
+    assert "in slots by satellite time, with polite spectrum access" in found.sentence
+    assert found.law == check_legal(found.radio, Region.EU868)
+    assert {finding.name for finding in found.law} == {
+        "band", "polite-on-time", "polite-packet", "polite-pause", "power",
+    }  # fmt: skip
+    assert all(finding.passed for finding in found.law)
+    received = replace(plan, radio=found.radio, receiver=replace(plan.receiver, channels=found.receiver_channels))
+    check = check_radio(received)
+    assert check.read_probability == pytest.approx(found.read_probability)
+    assert named(check, "slots").passed
+    assert named(check, "slots").figure == found.radio.slots.capacity  # type: ignore[union-attr]
+    rarer = replace(found.radio, interval_s=1.5 * found.radio.interval_s)
+    assert check_radio(replace(received, radio=rarer)).read_probability < plan.min_probability
+
+
+def test_of_settings_that_a_solar_cell_carries_the_most_probable_are_recommended() -> None:
+    plan = RadioPlan(EUROPE, region=Region.EU868, battery=Battery(sleep_ma=0.008, awake_ma=4.0, transmit_ma=25.5))
+    dark = recommend_settings(plan)
+    sunny = recommend_settings(replace(plan, battery=replace(plan.battery, solar_mw=400.0)))
+    assert dark.battery_days < 100
+    assert sunny.battery_days == MAX_BATTERY_DAYS
+    assert sunny.read_probability > dark.read_probability
+    assert sunny.read_probability > 0.999
+
+
+def test_slots_too_few_for_the_markers_in_range_are_named() -> None:
+    radio = replace(in_slots(RadioPlan(EUROPE, region=Region.EU868)).radio, interval_s=0.1, spreading_factor=7)
+    check = check_radio(RadioPlan(radio, Region.EU868, receiver=Receiver(channels=10)))
+    assert named(check, "slots").verdict is Verdict.WARN
+    assert named(check, "slots").figure == 10
+    assert check.read_probability < 0.5
+
+
+@pytest.mark.parametrize(("interval_s", "spreading_factor"), [(1.7, 7), (3.4, 7), (6.9, 9)])
+def test_the_probability_in_slots_is_that_of_the_simulation(interval_s: float, spreading_factor: int) -> None:
+    radio = replace(
+        in_slots(RadioPlan(EUROPE, region=Region.EU868)).radio,
+        interval_s=interval_s,
+        spreading_factor=spreading_factor,
+    )
+    predicted = check_radio(RadioPlan(radio, Region.EU868, receiver=Receiver(channels=10))).read_probability
+    counts = np.array([share_in_time(Design("", "", radio), (1, k), 800.0) for k in range(5)]).sum(axis=0)
+    share = counts[0] / counts[1]
+    # three standard deviations of the count, and half a per cent
+    assert share == pytest.approx(predicted, abs=0.005 + 3 * math.sqrt(predicted * (1 - predicted) / counts[1]))
 
 
 @pytest.mark.slow

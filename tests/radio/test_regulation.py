@@ -210,3 +210,44 @@ def test_the_region_of_a_place_is_known_inside_of_it_only() -> None:
     for region, found in places.items():
         for name, (lon_deg, lat_deg) in found.items():
             assert region_at(lon_deg, lat_deg) is region, name
+
+
+# --- polite spectrum access ---------------------------------------------------------------------------------------
+
+
+POLITE = replace(EUROPE, frequency_hz=863_100_000, channels=10, hopping=True, polite=True, interval_s=1.0)
+
+
+def test_polite_access_has_its_own_limits_in_place_of_a_duty_cycle() -> None:
+    found = findings(POLITE, Region.EU868)
+    assert set(found) == {"band", "polite-on-time", "polite-packet", "polite-pause", "power"}
+    assert {finding.verdict for finding in found.values()} == {Verdict.OK}
+    # 3,600 packets of 61.7 ms in an hour, over ten channels of 200 kHz
+    assert found["polite-on-time"].figure == pytest.approx(3600 * 0.061696 / 10)
+    assert found["polite-on-time"].limit == 100.0
+    assert found["polite-pause"].figure == pytest.approx(0.8 - 0.061696)
+    assert "above -81 dBm" in found["polite-on-time"].sentence  # 15 dB over -117 + 10 log10(125)
+    impolite = findings(replace(POLITE, polite=False), Region.EU868)
+    assert impolite["duty-cycle"].verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(("channels", "lawful"), [(2, False), (3, True)])
+def test_a_hundred_seconds_an_hour_on_any_200_khz_are_allowed(channels: int, lawful: bool) -> None:
+    # 222 s in an hour: 111 s on each of two channels, 74 s on each of three
+    assert is_permitted(replace(POLITE, channels=channels), Region.EU868) is lawful
+
+
+def test_packets_above_a_second_and_short_pauses_are_not_polite() -> None:
+    long = replace(POLITE, spreading_factor=12, interval_s=30.0)
+    assert findings(long, Region.EU868)["polite-packet"].verdict is Verdict.FAIL
+    hasty = replace(POLITE, interval_s=0.15, jitter_share=0.1)
+    assert findings(hasty, Region.EU868)["polite-pause"].verdict is Verdict.FAIL
+    even = replace(hasty, interval_s=0.17, slotted=True)  # slots have no jitter
+    assert findings(even, Region.EU868)["polite-pause"].verdict is Verdict.OK
+
+
+@pytest.mark.parametrize("how", [{"polite": True}, {"slotted": True, "channels": 2}])
+def test_a_polite_radio_and_slots_on_channels_need_hopping(how: dict[str, object]) -> None:
+    with pytest.raises(InvalidParameter) as caught:
+        replace(EUROPE, **how)  # type: ignore[arg-type]
+    assert caught.value.field == "hopping"

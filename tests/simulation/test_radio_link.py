@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from app.errors import InvalidParameter
+from app.radio.settings import Slots
 from app.simulation.radio.link import Radio, draw_shadows_db, mean_rssi_dbm, receive_transmissions, send_beacons
 
 LOUD_DBM = -80.0
@@ -125,3 +127,46 @@ def test_shadows_have_their_deviation_and_length() -> None:
 def test_radios_that_cannot_be_are_refused(how: dict[str, float]) -> None:
     with pytest.raises(InvalidParameter):
         Radio(**how)  # type: ignore[arg-type]
+
+
+# --- channels and slots -------------------------------------------------------------------------------------------
+
+
+SLOTTED = Radio(7, 125_000, 1.0, channels=4, slots=Slots(1.0, 0.066, 4))
+
+
+def test_in_slots_no_two_packets_meet_on_a_channel_unless_clocks_are_wrong() -> None:
+    for clock_sd_s, meets in ((0.0, False), (0.02, True)):
+        radio = replace(SLOTTED, clock_sd_s=clock_sd_s)
+        sent = send_beacons(60, radio, 1000.0, 1030.0, np.random.default_rng(4))
+        assert len(sent.start_s) == pytest.approx(60 * 30, abs=60)
+        assert (np.diff(sent.start_s) >= 0).all()
+        overlaps = sum(
+            int((np.diff(sent.start_s[sent.channel == one]) < radio.airtime_s - 1e-9).sum()) for one in range(4)
+        )
+        assert (overlaps > 0) is meets
+        for one in range(60):
+            mine = sent.start_s[sent.sender == one]
+            assert np.diff(mine) == pytest.approx(1.0)
+            assert (np.diff(sent.sequence[sent.sender == one]) == 1).all()
+
+
+def test_one_receiver_for_each_channel_reads_what_one_alone_loses() -> None:
+    radio = Radio(10, 125_000, 5.0)
+    start, strength = np.array([0.0, 0.05, 0.1]), np.full(3, LOUD_DBM)
+    together = receive_transmissions(start, strength, radio, np.random.default_rng(0))
+    apart = receive_transmissions(start, strength, radio, np.random.default_rng(0), np.array([0, 1, 2]))
+    assert not together.any()
+    assert apart.all()
+
+
+def test_packets_hop_evenly_over_channels() -> None:
+    sent = send_beacons(100, Radio(7, 500_000, 1.0, channels=5), 0.0, 100.0, np.random.default_rng(5))
+    assert np.abs(np.bincount(sent.channel, minlength=5) / len(sent.channel) - 0.2).max() < 0.03
+
+
+def test_another_modulation_has_its_own_airtime_and_sensitivity() -> None:
+    radio = Radio(interval_s=10.0, other_airtime_s=0.4, other_sensitivity_dbm=-100.0)
+    assert (radio.airtime_s, radio.sensitivity_dbm) == (0.4, -100.0)
+    heard = receive_transmissions(np.array([0.0, 5.0]), np.array([-104.0, -96.0]), radio, np.random.default_rng(0))
+    assert heard.tolist() == [False, True]

@@ -12,7 +12,15 @@ import numpy.typing as npt
 from app.errors import InvalidParameter
 from app.markers.cerpm import MESSAGE_BYTES
 from app.radio.link import MIN_DISTANCE_M, NEAR_DBM, NEAR_M, LinkModel, sensitivity_dbm
-from app.radio.settings import check_between, check_modulation, symbol_time_s, time_on_air_s
+from app.radio.settings import (
+    MAX_CHANNELS,
+    Slots,
+    check_between,
+    check_modulation,
+    check_whole,
+    symbol_time_s,
+    time_on_air_s,
+)
 from app.values import Bools, Floats, Ints
 
 # === Mean strength of a marker by two rays, the direct one and one reflected by the road, and a vehicle's antenna
@@ -165,9 +173,17 @@ class Radio:
     fading_sd_db: float = 2.0  # [dB] source: assumed, no measurement kept
     two_ray: TwoRay | None = None  # mean strength by two rays; None for log-distance
     antenna_pattern: AntennaPattern | None = None  # of the vehicle's antenna; None if it is alike in all directions
+    channels: int = 1  # hopped over, all of them received
+    slots: Slots | None = None  # in which markers send; None: from random phases, with jitter
+    clock_sd_s: float = 0.0  # [s] of the errors of markers' clocks, which move their slots; constant in a drive
+    # `other_airtime_s`, `other_sensitivity_dbm`: of another modulation than the LoRa of an SX1276. [s, dBm]
+    other_airtime_s: float | None = None
+    other_sensitivity_dbm: float | None = None
 
     def __post_init__(self) -> None:
         check_modulation(self.spreading_factor, self.bandwidth_hz)
+        check_whole("radio.channels", self.channels, 1, MAX_CHANNELS, "")
+        check_between("radio.clock_sd_s", self.clock_sd_s, 0.0, 3600.0, "s")
         if not (0 <= self.jitter < 0.5 and (1 - 2 * self.jitter) * self.interval_s > self.airtime_s):
             raise InvalidParameter(
                 f"an interval of {self.interval_s:g} s with a jitter of {self.jitter:g}",
@@ -178,6 +194,8 @@ class Radio:
     @property
     def airtime_s(self) -> float:
         """Time on air of one packet. [s]"""
+        if self.other_airtime_s is not None:
+            return self.other_airtime_s
         return time_on_air_s(
             self.payload_bytes, self.spreading_factor, self.bandwidth_hz, preamble_symbols=self.preamble_symbols
         )
@@ -195,6 +213,8 @@ class Radio:
     @property
     def sensitivity_dbm(self) -> float:
         """Strength at which half of the packets are received. [dBm]"""
+        if self.other_sensitivity_dbm is not None:
+            return self.other_sensitivity_dbm
         return sensitivity_dbm(self.spreading_factor, self.bandwidth_hz)
 
     @property
@@ -210,6 +230,7 @@ class Transmissions:
     sender: Ints  # shape (K,): index of the marker
     sequence: Ints  # shape (K,): of its message
     start_s: Floats  # shape (K,) [s]
+    channel: Ints  # shape (K,)
 
 
 def mean_rssi_dbm(distance_m: npt.ArrayLike) -> Floats:
@@ -225,6 +246,7 @@ def send_beacons(
     rng: np.random.Generator,
     *,
     first_sequence: npt.ArrayLike | None = None,
+    place: npt.ArrayLike | None = None,
 ) -> Transmissions:
     """Transmissions of independent markers from one time to another.
 
@@ -235,24 +257,36 @@ def send_beacons(
     start_s, end_s : float
         [s]
     rng : numpy.random.Generator
-        Draws phases, jitter and first sequences.
+        Draws phases, jitter, channels and first sequences; in slots, errors of clocks.
     first_sequence : array_like of int, shape (count,), optional
         Drawn below 1,000,000 by default.
+    place : array_like of int, shape (count,), optional
+        Of each marker in a frame of slots; in order by default.
 
     Notes
     -----
-    A marker's slots are one interval apart from a random phase; each transmission is uniformly early or late in its
-    slot. Clocks of 20 ppm do not matter within a drive.
+    A marker's turns are one interval apart. Without slots they have a random phase; each transmission is uniformly
+    early or late in its turn, and hops to a random channel. Clocks of 20 ppm do not matter within a drive. In slots a
+    clock that is wrong by more than the guard time collides with the neighbouring slots.
     """
-    slots = int((end_s - start_s) / radio.interval_s) + 2
+    turns = int((end_s - start_s) / radio.interval_s) + 2
     first = rng.integers(0, 1_000_000, count) if first_sequence is None else np.asarray(first_sequence, int)
-    phase = rng.uniform(-1, 0, (count, 1)) * radio.interval_s
-    jitter = rng.uniform(-radio.jitter, radio.jitter, (count, slots)) * radio.interval_s
-    start = start_s + phase + np.arange(slots) * radio.interval_s + jitter
-    sender, slot = np.nonzero((start >= start_s) & (start < end_s))
-    sent = start[sender, slot]
+    if radio.slots is None:
+        phase = rng.uniform(-1, 0, (count, 1)) * radio.interval_s
+        jitter = rng.uniform(-radio.jitter, radio.jitter, (count, turns)) * radio.interval_s
+        start = start_s + phase + np.arange(turns) * radio.interval_s + jitter
+        channel = rng.integers(0, radio.channels, start.shape) if radio.channels > 1 else np.zeros(start.shape, int)
+    else:
+        places = np.arange(count) if place is None else np.asarray(place, int)
+        frame = math.floor(start_s / radio.slots.frame_s) + np.arange(turns)
+        slot, channel = radio.slots.at(places[:, None], frame)
+        late_s = rng.normal(0, radio.clock_sd_s, (count, 1))
+        start = frame * radio.slots.frame_s + slot * radio.slots.slot_s + late_s
+    sender, turn = np.nonzero((start >= start_s) & (start < end_s))
+    sent = start[sender, turn]
     order = np.argsort(sent, kind="stable")
-    return Transmissions(sender[order], (first[sender] + slot)[order], sent[order])
+    sender, turn = sender[order], turn[order]
+    return Transmissions(sender, first[sender] + turn, sent[order], channel[sender, turn])
 
 
 def draw_shadows_db(sender: Ints, travelled_m: Floats, radio: Radio, rng: np.random.Generator) -> Floats:
@@ -278,8 +312,10 @@ def draw_shadows_db(sender: Ints, travelled_m: Floats, radio: Radio, rng: np.ran
     return shadows * radio.shadow_sd_db
 
 
-def receive_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, rng: np.random.Generator) -> Bools:
-    """Which transmissions one receiver reads.
+def receive_transmissions(
+    start_s: Floats, strength_dbm: Floats, radio: Radio, rng: np.random.Generator, channel: Ints | None = None
+) -> Bools:
+    """Which transmissions one receiver reads; on each of several channels it reads one packet at a time.
 
     Parameters
     ----------
@@ -291,6 +327,8 @@ def receive_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, r
         All send with the same settings.
     rng : numpy.random.Generator
         Draws receptions near the sensitivity.
+    channel : ndarray of int, shape (K,), optional
+        Of each transmission; by default all are on one.
 
     Returns
     -------
@@ -303,6 +341,12 @@ def receive_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, r
     receiver locks on to a preamble if it is idle and then receives nothing else until that packet is over: another
     packet that begins meanwhile is lost, and if it is strong enough, the first one too.
     """
+    if channel is not None:
+        received = np.zeros(len(start_s), bool)
+        for one in np.unique(channel):
+            here = np.flatnonzero(channel == one)
+            received[here] = receive_transmissions(start_s[here], strength_dbm[here], radio, rng)
+        return received
     airtime, spare = radio.airtime_s, radio.spare_s
     odds = 1 / (1 + np.exp(-np.clip((strength_dbm - radio.sensitivity_dbm) / _SOFT_DB, -60, 60)))
     audible = rng.random(len(start_s)) < odds

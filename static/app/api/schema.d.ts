@@ -2651,10 +2651,14 @@ export interface components {
             capacity_mah?: number;
             /** @default 0.8 */
             sleep_ma?: number;
+            /** @default 0 */
+            solar_mw?: number;
             /** @default null */
             transmit_ma?: number | null;
             /** @default 0.8 */
             usable_share?: number;
+            /** @default 0.5 */
+            winter_sun_h?: number;
         };
         BillDocument: {
             alternatives: components["schemas"]["CostDocument"][];
@@ -5916,10 +5920,18 @@ export interface components {
             jitter_share?: number;
             /** @default false */
             lorawan?: boolean;
+            /** @default 0 */
+            place?: number;
+            /** @default false */
+            polite?: boolean;
             /** @default 20 */
             power_dbm?: number;
             /** @default 8 */
             preamble_symbols?: number;
+            /** @default 0.004 */
+            slot_guard_s?: number;
+            /** @default false */
+            slotted?: boolean;
             /** @default 7 */
             spreading_factor?: number;
         };
@@ -5935,8 +5947,12 @@ export interface components {
             interval_s: number;
             jitter_share: number;
             lorawan: boolean;
+            place: number;
+            polite: boolean;
             power_dbm: number;
             preamble_symbols: number;
+            slot_guard_s: number;
+            slotted: boolean;
             spreading_factor: number;
         };
         ReadGeometryDocument: {
@@ -6021,6 +6037,7 @@ export interface components {
         };
         Recommendation: {
             battery_days: number;
+            law: components["schemas"]["RadioFinding"][];
             radio: components["schemas"]["RadioSettings-Output"] | null;
             reaches: boolean;
             read_probability: number;

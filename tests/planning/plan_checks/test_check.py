@@ -141,9 +141,13 @@ def test_the_law_of_the_place_is_named() -> None:
     assert "unknown" in unknown.sentence
     assert "EU868" not in unknown.sentence
     lawful = checked(inside, cerpm={"region": "EU868"})
-    names = ("radio law", "radio band", "radio duty-cycle", "radio power")
+    names = (
+        "radio law", "radio band", "radio polite-on-time", "radio polite-packet", "radio polite-pause", "radio power",
+        "radio slots", "radio read-in-time",
+    )  # fmt: skip
     assert {finding(lawful, name).verdict for name in names} == {Verdict.OK}
-    assert finding(lawful, "radio read-in-time").verdict is not Verdict.OK  # no lawful settings read 99 % in time
+    assert lawful.radio is not None
+    assert lawful.radio.slotted
 
 
 def test_radio_settings_are_recommended_for_the_busiest_place() -> None:
