@@ -63,7 +63,7 @@ def end_with_parent() -> None:
 def load_decoders() -> None:
     """Import all, and run the plate decoder once; garbage collection in a fork then leaves all of it alone."""
     gc.disable()  # it would free nothing and take a fifth of the time
-    from app.families.plate.frames import decode_plates
+    from app.decoding.frames import decode_plates
     from app.jobs.decoder_process import warm_process
 
     for name in (*TASKS, *DECODERS):
