@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.pose import VehicleFix, fix_vehicle
+from app.decoders.plate.pose import VehicleFix, fix_vehicle, with_pose
 from app.decoding.declarations import CoarsePosition
 from app.geodesy import LocalizationGrade, enu_from_wgs84, wgs84_from_enu, worst_grade
 from app.geodesy.frames import distance_m
@@ -133,6 +133,20 @@ def match_plate(nearby: Nearby, code: PlateCode, position: CoarsePosition) -> Ma
     """The nearest of the plates nearby that carry a code; None if there is none."""
     rows = [row for row in nearby.rows if row.digits == code.digits and row.n == code.n]
     return nearest_match(rows, position, "plate") if rows else None
+
+
+def with_registered_size(reading: PlateReading, match: Match, camera: Camera | None) -> PlateReading:
+    """A matched plate with its registered dimensions and the pose that follows from them.
+
+    A frame shows proportions, and plates of 35 and 50 mm units have nearly the same: with the wrong size, the vehicle's
+    position is off by a quarter of the distance from the plate.
+    """
+    row, found = match.row, reading.geometry
+    if row is None or not match.plausible or found is None or row.n != found.n:
+        return reading
+    if (row.unit_mm, row.gap_mm) == (found.unit_mm, found.gap_mm):
+        return reading
+    return with_pose(replace(reading, geometry=plate_geometry(row), pose=None), camera)
 
 
 def plate_codebook(nearby: Nearby) -> tuple[PlateCode, ...]:

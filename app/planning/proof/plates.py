@@ -17,7 +17,15 @@ import numpy.typing as npt
 
 from app.decoders.plate.pose import VehicleFix
 from app.decoding.declarations import CoarsePosition, DecodeContext
-from app.decoding.frames import Nearby, fix_from_match, fuse_fixes, match_plate, read_plates, search_plates
+from app.decoding.frames import (
+    Nearby,
+    fix_from_match,
+    fuse_fixes,
+    match_plate,
+    read_plates,
+    search_plates,
+    with_registered_size,
+)
 from app.formats.images import load_image
 from app.geodesy import enu_from_heading, enu_from_wgs84, wgs84_from_enu
 from app.markers.reading import MarkerRow
@@ -292,8 +300,9 @@ def _read(
         else:
             out.wrong.append(reading.code.digits)
         match = match_plate(nearby, reading.code, position)
-        if match is not None and reading.pose is not None:
-            fix = fix_from_match(reading.pose, camera, match, "plate", context.heading_deg, epoch=EPOCH)
+        pose = None if match is None else with_registered_size(reading, match, camera).pose
+        if match is not None and pose is not None:
+            fix = fix_from_match(pose, camera, match, "plate", context.heading_deg, epoch=EPOCH)
             fixes += [fix] if fix is not None else []
     fused = fuse_fixes(fixes)
     return read, None if fused is None else fused.vehicle

@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.pose import locate_moving_plate, with_pose
 from app.decoding.declarations import CoarsePosition, DeclaredFrames, DecodeContext
-from app.decoding.frames import Match, fix_from_match, fuse_fixes
+from app.decoding.frames import Match, fix_from_match, fuse_fixes, with_registered_size
 from app.errors import ProcessStopped, Unavailable, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.families import get_family
 from app.families.family import FrameReading
@@ -153,8 +153,11 @@ def read_frame(
         speed_m_s = moment.pose.speed_m_s
     markers = []
     for found in result.readings:
-        reading = at_middle_row(found, camera, speed_m_s)
-        match = match_reading(connection, upload.agency_id, reading, context.coarse_position, nearby)
+        match = match_reading(connection, upload.agency_id, found, context.coarse_position, nearby)
+        reading = found
+        if match is not None and isinstance(found, PlateReading):
+            reading = with_registered_size(found, match, camera)
+        reading = at_middle_row(reading, camera, speed_m_s)
         fix = None
         if match is not None and camera is not None and reading.pose is not None:
             label = get_family(reading.family).label
