@@ -66,7 +66,7 @@ START = datetime(2026, 6, 2, 8, tzinfo=UTC)
 """When drives begin."""
 EPOCH = decimal_year(START)
 HEADING_RMSE_DEG = 0.1
-"""[deg] of a plate's or tag's surveyed direction. Source: TAG_BEARING_STD_DEG of app/decoders/magnet/identify.py."""
+"""[deg] of a plate's surveyed direction. Source: assumed, 0.5 mm across its side."""
 COARSE_M = 20.0
 """[m] accuracy of a vehicle's coarse position. Source: assumed, between streets and buildings."""
 RADIUS_95 = 2.4477  # standard deviations of each axis in the radius that contains 95 %
@@ -88,10 +88,11 @@ def surveyed_row(
     found_m = np.array([*rng.normal(off_m, rmse_m / math.sqrt(2)), 0.0])
     lon_deg, lat_deg, _height = wgs84_from_enu(found_m, (row.lon_deg, row.lat_deg, row.height_m or 0.0))
     stated_m = max(rmse_m, _MIN_RMSE_M)
-    heading = None if row.heading_deg is None else (row.heading_deg + float(rng.normal(0, HEADING_RMSE_DEG))) % 360.0
+    if row.family == "plate" and row.heading_deg is not None:  # that of a tag follows from its lane
+        heading_deg = (row.heading_deg + float(rng.normal(0, HEADING_RMSE_DEG))) % 360.0
+        row = row._replace(heading_deg=heading_deg, heading_rmse_deg=HEADING_RMSE_DEG)
     return row._replace(
-        status="surveyed", lon_deg=lon_deg, lat_deg=lat_deg, heading_deg=heading,
-        heading_rmse_deg=None if heading is None else HEADING_RMSE_DEG, realization="ITRF2014", epoch=EPOCH,
+        status="surveyed", lon_deg=lon_deg, lat_deg=lat_deg, realization="ITRF2014", epoch=EPOCH,
         horizontal_rmse_m=stated_m, vertical_rmse_m=stated_m, survey_method="GNSS RTK", transform_accuracy_m=0.0,
         localization_grade=grade_accuracy(total_accuracy_m(stated_m, 0.0)).value, transform_note=None,
     )  # fmt: skip
