@@ -376,9 +376,9 @@ def drive_line(one: MagnetPass, weight: float) -> tuple[list[MarkerPass], list[W
 
 def decode_upload(one: MagnetPass, simulated: SimulatedDrive) -> ReadTrace:
     """What the server reads in the recording of a drive that is uploaded to it."""
-    files = {name: io.BytesIO(content) for name, content in write_tables(simulated.trace).items()}
     declared = DeclaredTrace(unit="uT", axes="ISO8855", bar=BarDeclaration(forward_m=FORWARD_M))
-    trace = read_trace(files, declared).trace
+    with pack(write_tables(simulated.trace)).open() as stream:
+        trace = read_trace({"drive.zip": stream}, declared).trace
     nearby = NearbyTags.of(one.rows, EPOCH)
     findings, _version = find_magnets(trace, declared, nearby.texts, () if nearby.texts else one.formats)
     return nearby.match(findings, declared.sensors)
