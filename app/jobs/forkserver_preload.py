@@ -40,6 +40,7 @@ DECODERS = (
     "app.planning.build_alignment",
     "app.planning.planner",
     "app.planning.predict.printed_plate",
+    "app.planning.proof.drives",
     "app.planning.proof.prove",
     "app.plots.print_report",
     "app.simulation.magnetic.dipoles",
