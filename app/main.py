@@ -31,13 +31,12 @@ from app.api.public_pages.pages import FormLimits
 from app.control.metrics import ProcessMetrics
 from app.control.operations import OperatorCases
 from app.control.server import ControlServer
+from app.decoding.frames import DecodePlates, decode_plates
 from app.errors import Unavailable, is_disk_full
-from app.families.plate.frames import decode_plates
 from app.jobs.queues import LocalQueue
 from app.published_settings import other_hosts, page_settings_of, server_settings_of
 from app.registry.database import Database
 from app.services.access.access import Access
-from app.services.decodes.frame_tasks import DecodePlates
 from app.services.ports import utc_now
 from app.settings import Settings
 from app.storage.spool import find_folder_fault

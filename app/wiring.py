@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from app.decoding.frames import DecodePlates
 from app.encoders.plate import PlateReader
 from app.families.surveys import MarkerRules
 from app.formats.format import ArchiveLimits
@@ -32,7 +33,6 @@ from app.services.access.keys import Agencies, Keys
 from app.services.blobs import UnusedBlobs
 from app.services.decodes.context import DecodeRules
 from app.services.decodes.decodes import DecodeDetails, Decodes
-from app.services.decodes.frame_tasks import DecodePlates
 from app.services.decodes.frames import ArchiveHandler, FrameHandler
 from app.services.decodes.outputs import DecodeOutputs
 from app.services.decodes.recordings import PacketHandler, TraceHandler

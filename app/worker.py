@@ -9,12 +9,11 @@ from contextlib import closing, contextmanager
 import structlog
 
 from app.control.metrics import MetricsServer, ProcessMetrics
+from app.decoding.frames import DecodePlates, decode_plates
 from app.errors import InvalidParameter, Unavailable
-from app.families.plate.frames import decode_plates
 from app.jobs.celery_queue import CeleryQueue
 from app.jobs.celery_worker import CeleryWorker
 from app.registry.database import Database, head_revision
-from app.services.decodes.frame_tasks import DecodePlates
 from app.services.jobs import QueueName
 from app.services.ports import utc_now
 from app.settings import Settings

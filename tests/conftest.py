@@ -23,15 +23,16 @@ from fastapi import FastAPI
 
 from app.api.http.connections import ConnectionLimits, limited_connections
 from app.decoders.plate.reader import decode_plates
+from app.decoding.frames import DecodePlates
 from app.jobs import queues
 from app.main import create_app
+from app.markers.reading import MarkerRow
 from app.registry.column_types import row_of
 from app.registry.database import Database
 from app.registry.engines import across_agencies
 from app.registry.features import feature_text
-from app.registry.marker_rows import MarkerRow, markers
+from app.registry.marker_rows import markers
 from app.services.access.access import Scope
-from app.services.decodes.frame_tasks import DecodePlates
 from app.settings import Settings
 from app.worker import running_worker
 from tests import machine

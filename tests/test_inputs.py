@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
+from app.decoding.declarations import DecodeContext, UploadContext
 from app.errors import InvalidParameter
 from app.inputs import parse_input
 from app.lanes.types import LaneDeclaration, LaneRules
-from app.services.decodes.declarations import DecodeContext, UploadContext
 
 CAMERA = {"width_px": 96, "height_px": 64, "fx_px": 80.0, "fy_px": 80.0, "cx_px": 47.5}
 

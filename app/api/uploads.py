@@ -23,6 +23,7 @@ from app.api.http.permissions import UPLOADERS
 from app.api.http.problems import BodyRefused, Described, problem_responses, reference
 from app.api.http.responses import BINARY, document_response, json_response
 from app.api.http.routes import Router
+from app.decoding.declarations import UploadContext
 from app.errors import (
     MalformedRequest,
     UnsupportedUpload,
@@ -33,7 +34,6 @@ from app.errors import (
 )
 from app.formats.format import SpooledFile
 from app.inputs import Identifier
-from app.services.decodes.declarations import UploadContext
 from app.services.uploads.quotas import UploadDocument
 from app.services.uploads.uploads import Grant, Uploads
 from app.services.uploads.uploads import Uploads as UploadsService

@@ -160,8 +160,8 @@ def decode_trace(
     import orjson
 
     from app.decoders.magnet.identify import match_tags
+    from app.decoding.declarations import DeclaredTrace
     from app.formats.format import SpooledFile
-    from app.services.decodes.declarations import DeclaredTrace
     from app.services.decodes.trace_documents import trace_result
     from app.services.decodes.trace_tasks import decode_recording
 

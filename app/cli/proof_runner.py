@@ -11,8 +11,10 @@ from pathlib import Path
 import orjson
 
 from app.errors import UnreadableUpload
+from app.families import rows_of_plan
 from app.planning.outputs.plan_document import read_plan
 from app.planning.proof import ProofReport, ProofTerms, ProofUnit, UnitResult, summarize
+from app.planning.proof.drives import START
 from app.planning.proof.prove import Prover
 from app.values import JsonObject
 
@@ -40,7 +42,7 @@ def run_proof(plan_file: Path, terms: ProofTerms, results_file: Path, workers: i
         The plan's file is no plan.
     """
     data = plan_file.read_bytes()
-    prover = Prover(read_plan(data), terms)
+    prover = _prover_of(data, terms)
     units = prover.list_units()
     header = {"plan": hashlib.sha256(data).hexdigest(), "terms": terms.model_dump(mode="json")}
     results = _finished(results_file, header)
@@ -95,7 +97,12 @@ def _compute(plan_file: Path, prover: Prover, units: list[ProofUnit], workers: i
 def _start(plan_file: Path, terms: ProofTerms) -> None:
     """Prepare a worker process."""
     global _prover
-    _prover = Prover(read_plan(plan_file.read_bytes()), terms)
+    _prover = _prover_of(plan_file.read_bytes(), terms)
+
+
+def _prover_of(data: bytes, terms: ProofTerms) -> Prover:
+    plan = read_plan(data)
+    return Prover(plan, terms, rows_of_plan(plan, START))
 
 
 def _work(unit: ProofUnit) -> UnitResult:

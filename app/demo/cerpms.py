@@ -22,9 +22,9 @@ from app.lanes.overlay import VehiclePose, lane_in_frame, ned_from_enu
 from app.markers.cerpm import CerpmMessage, LaneSide
 from app.planning.cerpm_placement import place_markers
 from app.sensors.camera import Camera
-from app.sensors.pose_track import PoseTrack, ReceivedPacket
+from app.sensors.pose_track import ReceivedPacket
 from app.simulation.radio.attacks import forge_packets, move_claim, number_entries, replay_packets
-from app.simulation.radio.drive import SatelliteReceiver, SimulatedDrive, drive_past
+from app.simulation.radio.drive import SatelliteReceiver, SimulatedDrive, drive_past, write_packets, write_poses
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_from_wgs84
 from app.simulation.radio.link import Radio
 from app.simulation.steering import PoseNoise, check_steering
@@ -241,31 +241,6 @@ def _pack(built: BuiltLane, simulated: SimulatedDrive, packets: Sequence[Receive
         archive.writestr("poses.csv", write_poses(simulated.track))
         archive.writestr("frame.jpg", draw_frame(built.lane, simulated, at_s))
     return packed.getvalue(), datetime.fromtimestamp(at_s, UTC).isoformat()
-
-
-def write_packets(packets: Sequence[ReceivedPacket]) -> str:
-    """A receiver's log: a JSON object a packet."""
-    lines = [
-        {
-            "time": datetime.fromtimestamp(packet.received_at_s, UTC).isoformat(),
-            "payload_hex": packet.payload.hex() if packet.payload else "",
-            "rssi_dbm": packet.rssi_dbm,
-            "snr_db": packet.snr_db,
-        }
-        for packet in packets
-    ]
-    return "".join(json.dumps(line) + "\n" for line in lines)
-
-
-def write_poses(track: PoseTrack) -> str:
-    """A track as CSV."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(("time_s", "lon_deg", "lat_deg", "heading_deg", "accuracy_m"))
-    for row in zip(track.time_s, track.lon_deg, track.lat_deg, track.heading_deg, track.accuracy_m, strict=True):
-        time_s, lon, lat, heading, accuracy = (float(value) for value in row)
-        writer.writerow((f"{time_s:.3f}", f"{lon:.9f}", f"{lat:.9f}", f"{heading:.3f}", f"{accuracy:.3f}"))
-    return stream.getvalue()
 
 
 def draw_frame(lane: TrueLane, simulated: SimulatedDrive, at_s: float) -> bytes:

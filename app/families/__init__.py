@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable
+from datetime import datetime
 from functools import reduce
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,6 +15,12 @@ from app.families.family import AnyFamily
 from app.families.fiducial import FIDUCIAL
 from app.families.magnet.magnets import MAGNET
 from app.families.plate.plates import PLATE
+from app.families.surveys import PLANNED, Commitment, MarkerRules
+from app.markers.reading import MarkerRow
+from app.planning.plan import Plan
+from app.planning.plan_checks.families import radio_settings
+from app.radio.settings import RadioSettings
+from app.registry.column_types import row_of
 
 FAMILIES: tuple[AnyFamily, ...] = (PLATE, MAGNET, CERPM, FIDUCIAL)
 FAMILY_NAMES = tuple(family.name for family in FAMILIES)
@@ -28,6 +35,23 @@ else:
 def get_family(name: str) -> AnyFamily:
     """The family with a name that the registry stores."""
     return _BY_NAME[name]
+
+
+def rows_of_plan(plan: Plan, now: datetime) -> dict[int, MarkerRow]:
+    """Rows of a plan's markers as its commit stores them, by their numbers in the plan, which are their ids too.
+
+    The row of a line of magnets has the number of its first magnet.
+    """
+    radio = plan.radio or radio_settings(plan) or RadioSettings()
+    commitment = Commitment("", plan.alignment, MarkerRules(), now, radio=radio)
+    same = {"status": PLANNED, "version": 1, "created_at": now, "updated_at": now}
+    rows = {}
+    for family in FAMILIES:
+        own = [marker for marker in plan.markers if marker.family == family.name]
+        for planned in family.planned_rows(commitment, own) if own else ():
+            columns = {**same, **planned.columns, "id": str(planned.number), "family": family.name}
+            rows[planned.number] = row_of(MarkerRow, columns)
+    return rows
 
 
 def union_of(shapes: Iterable[Any]) -> Any:

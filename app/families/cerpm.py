@@ -11,6 +11,7 @@ import sqlalchemy as sa
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 from typing_extensions import TypedDict
 
+from app.decoding.recordings import side_of, speed_limit_of
 from app.errors import CodeTaken, InvalidParameter
 from app.families.documents import (
     FamilyChange,
@@ -41,7 +42,8 @@ from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import PlacedPosition
 from app.geodesy.frames import ecef_from_wgs84
-from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
+from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, CerpmMessage, LaneSide, SpeedLimit
+from app.markers.reading import MarkerRow
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedCerpm, PlannedMarker
 from app.radio.settings import RadioSettings, assign_places
@@ -49,27 +51,11 @@ from app.registry import markers as cerpms
 from app.registry.bulk_load import Columns
 from app.registry.column_types import row_of
 from app.registry.lines import CerpmRuns
-from app.registry.marker_rows import CodeRow, MarkerRow, markers
+from app.registry.marker_rows import CodeRow, markers
 from app.surveys.georeference import GeoreferencedSurvey
 from app.values import Bools
 
 # === The row of a CERPM as values of the core: what it sends, its side, its speed limit and its radio.
-
-
-def speed_limit_of(row: MarkerRow) -> SpeedLimit | None:
-    """Speed limit of a CERPM's row."""
-    stored = row.spec["speed_limit"]
-    return None if stored is None else SpeedLimit(stored["value"], SpeedUnit(stored["unit"]))
-
-
-def side_of(row: MarkerRow) -> LaneSide:
-    """Lane side of a CERPM's row."""
-    return LaneSide[row.spec["side"].upper()]
-
-
-def radio_of(row: MarkerRow) -> RadioSettings:
-    """Radio of a CERPM's row."""
-    return RadioSettings(**row.spec["radio"])
 
 
 def message_of(row: MarkerRow, sequence: int = 0) -> CerpmMessage:

@@ -14,9 +14,8 @@ from app.geodesy import PlacedPosition, place_position
 from app.geodesy.place import Grade
 from app.geodesy.systems import VerticalDatum as VerticalDatum
 from app.inputs import Number, StrictModel, Text
-from app.markers.reading import Status
+from app.markers.reading import MarkerRow, Status
 from app.registry.conditions import grade_columns
-from app.registry.marker_rows import MarkerRow
 
 
 class PositionDocument(TypedDict):

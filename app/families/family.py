@@ -17,17 +17,18 @@ import numpy.typing as npt
 import sqlalchemy as sa
 from pydantic import JsonValue
 
+from app.decoding.declarations import CoarsePosition
+from app.decoding.frames import Match, Nearby, Pixels
 from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkOptions, Drawing, PlateReader
 from app.families.documents import FamilyChange, MarkerDocument, MarkerIn
 from app.families.surveys import ColumnValues, Commitment, MarkerRules, PlannedRow, SurveyImport
-from app.markers.reading import PlatePose
+from app.markers.reading import MarkerRow, PlatePose
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedMarker
 from app.registry.database import Database
 from app.registry.lines import LineSource
-from app.registry.marker_rows import CodeRow, MarkerRow
-from app.registry.spatial import distance_m
+from app.registry.marker_rows import CodeRow
 from app.sensors.camera import Camera
 
 # === Files that a marker can be downloaded as.
@@ -49,9 +50,6 @@ def rounded(values: npt.NDArray[np.float64] | None, places: int) -> list[list[fl
 # === How the markers of a family are read in camera frames.
 
 
-Pixels = npt.NDArray[np.uint8]
-
-
 class FrameReading(Protocol):
     """What the readings of every family have."""
 
@@ -63,45 +61,6 @@ class FrameReading(Protocol):
     def confidence(self) -> float: ...
     @property
     def pose(self) -> PlatePose | None: ...
-
-
-class ApproximatePosition(Protocol):
-    """Where the vehicle is, and how far from there a marker in view can be."""
-
-    @property
-    def lon_deg(self) -> float: ...
-    @property
-    def lat_deg(self) -> float: ...
-    @property
-    def reach_m(self) -> float: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Nearby:
-    """The agency's markers of one family that could be in view."""
-
-    rows: tuple[MarkerRow, ...] = ()  # nearest first
-    complete: bool = True  # False if there are more than a search may hold
-
-
-@dataclass(frozen=True, slots=True)
-class Match:
-    """The registered marker that a reading is of, or where an unregistered one would be."""
-
-    row: MarkerRow | None  # the registered marker
-    # `lon_deg`, `lat_deg`: [deg] of the registered marker, or by the digits of an unregistered one
-    lon_deg: float | None = None
-    lat_deg: float | None = None
-    distance_m: float | None = None  # [m] from the approximate position
-    plausible: bool = False  # whether that is within the accuracy of the approximate position and the range of view
-    others: tuple[str, ...] = ()  # ids of further markers with the same code within reach
-    note: str = ""  # what to know about the match
-    fits_two_places: bool = False  # the digits of an unregistered marker fit two places within reach
-
-    @property
-    def ambiguous(self) -> bool:
-        """Whether more than one marker or place fits."""
-        return bool(self.others) or self.fits_two_places
 
 
 ReadingT = TypeVar("ReadingT", bound=FrameReading)
@@ -127,7 +86,7 @@ class FrameReader(ABC, Generic[ReadingT, SearchT]):
         connection: sa.Connection,
         agency_id: str,
         reading: ReadingT,
-        position: ApproximatePosition | None,
+        position: CoarsePosition | None,
         nearby: Nearby,
     ) -> Match | None:
         """The registered marker of a reading; None where nothing was read or no position is known."""
@@ -139,19 +98,6 @@ class FrameReader(ABC, Generic[ReadingT, SearchT]):
     @abstractmethod
     def observation(self, reading: ReadingT) -> dict[str, object]:
         """Detail of the observation that a matched reading makes of its marker."""
-
-
-def nearest_match(rows: Sequence[MarkerRow], position: ApproximatePosition, label: str) -> Match:
-    """The nearest of the markers that carry the code of a reading."""
-    ranked = sorted(rows, key=lambda row: distance_to_row(row, position))
-    row, others = ranked[0], tuple(other.id for other in ranked[1:])
-    note = f"ambiguous: {len(ranked)} {label}s within reach carry these digits; this is the nearest" if others else ""
-    return Match(row, row.lon_deg, row.lat_deg, distance_to_row(row, position), True, others, note)
-
-
-def distance_to_row(row: MarkerRow, position: ApproximatePosition) -> float:
-    """Distance of a marker from the approximate position. [m]"""
-    return distance_m(position.lon_deg, position.lat_deg, row.lon_deg, row.lat_deg)
 
 
 # === What a family of markers declares. All other code asks the declaration; `app.families.FAMILIES` lists them.

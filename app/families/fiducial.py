@@ -12,6 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from typing_extensions import TypedDict
 
 from app.decoders.fiducial import FiducialReading, decode_fiducials
+from app.decoding.declarations import CoarsePosition
+from app.decoding.frames import Match, Nearby, Pixels, nearest_match
 from app.encoders.fiducial import FiducialOrder, encode_fiducial, prove_fiducial
 from app.encoders.plate import ArtworkOptions, Drawing, PlateReader
 from app.errors import CodeTaken, InvalidParameter, WaymarkError, naming
@@ -27,16 +29,11 @@ from app.families.documents import (
     position_columns,
 )
 from app.families.family import (
-    ApproximatePosition,
     ArtworkProof,
     Family,
     FrameReader,
-    Match,
-    Nearby,
-    Pixels,
     Registration,
     map_point,
-    nearest_match,
     rounded,
 )
 from app.families.surveys import (
@@ -52,14 +49,14 @@ from app.families.surveys import (
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import PlacedPosition
+from app.geodesy.frames import distance_m
 from app.inputs import Number, StrictModel, Text
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting, get_dictionary
-from app.markers.reading import PlatePose
+from app.markers.reading import MarkerRow, PlatePose
 from app.planning.outputs.hd_map import MapMarker
 from app.registry import markers as store
 from app.registry.bulk_load import Columns
-from app.registry.marker_rows import CodeRow, MarkerRow
-from app.registry.spatial import distance_m
+from app.registry.marker_rows import CodeRow
 from app.sensors.camera import Camera
 from app.surveys.georeference import GeoreferencedSurvey
 
@@ -210,7 +207,7 @@ class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
         connection: sa.Connection,
         agency_id: str,
         reading: FiducialReading,
-        position: ApproximatePosition | None,
+        position: CoarsePosition | None,
         nearby: Nearby,
     ) -> Match | None:
         """The registered sign with the code that was read, nearest to the approximate position."""

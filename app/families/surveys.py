@@ -17,12 +17,13 @@ from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Texts
 from app.markers.plate import Digits
+from app.markers.reading import MarkerRow
 from app.planning.alignment import Alignment
 from app.planning.plan import PlannedMarker
 from app.radio.settings import RadioSettings
 from app.registry.bulk_load import Columns
 from app.registry.conditions import grade_columns
-from app.registry.marker_rows import CodeRow, MarkerRow
+from app.registry.marker_rows import CodeRow
 from app.surveys.georeference import GeoreferencedSurvey
 from app.values import Bools, JsonObject
 

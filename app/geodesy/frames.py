@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 import pymap3d
+from pyproj import Geod
 
 from app.errors import InvalidParameter
 from app.values import Floats
@@ -81,3 +83,14 @@ def check_lon_lat(lon_deg: float, lat_deg: float, field: str = "position") -> No
                 limit=f"-{bound:g} to {bound:g} deg",
                 cure="positions are longitude, latitude in degrees; check for swapped axes or another CRS",
             )
+
+
+def distance_m(lon_a_deg: float, lat_a_deg: float, lon_b_deg: float, lat_b_deg: float) -> float:
+    """Geodesic distance on WGS 84. [m]"""
+    return float(ellipsoid().inv(lon_a_deg, lat_a_deg, lon_b_deg, lat_b_deg)[2])
+
+
+@lru_cache
+def ellipsoid() -> Geod:
+    """WGS 84, for geodesics."""
+    return Geod(ellps="WGS84")

@@ -24,10 +24,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from app.decoding.frames import DecodePlates
 from app.errors import ProcessStopped, WaymarkError
 from app.markers.plate import PlateCode
 from app.services.decoder_tasks import out_of_memory, ran_short
-from app.services.decodes.frame_tasks import DecodePlates, use_decoder
+from app.services.decodes.frame_tasks import use_decoder
 
 # === What the kernel keeps a decoder process from: memory, files, processor time, the network, other folders' files.
 

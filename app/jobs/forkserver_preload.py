@@ -40,6 +40,7 @@ DECODERS = (
     "app.planning.build_alignment",
     "app.planning.planner",
     "app.planning.predict.printed_plate",
+    "app.planning.proof.drives",
     "app.planning.proof.prove",
     "app.plots.print_report",
     "app.simulation.magnetic.dipoles",
@@ -63,7 +64,7 @@ def end_with_parent() -> None:
 def load_decoders() -> None:
     """Import all, and run the plate decoder once; garbage collection in a fork then leaves all of it alone."""
     gc.disable()  # it would free nothing and take a fifth of the time
-    from app.families.plate.frames import decode_plates
+    from app.decoding.frames import decode_plates
     from app.jobs.decoder_process import warm_process
 
     for name in (*TASKS, *DECODERS):

@@ -26,6 +26,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, TypeVarTuple
 import structlog
 
 from app import tracing
+from app.decoding.frames import DecodePlates
 from app.errors import ProcessStopped, Unavailable
 from app.jobs.decoder_process import (
     ONE_THREAD,
@@ -42,7 +43,6 @@ from app.jobs.decoder_process import (
 from app.jobs.queues import FairQueue
 from app.registry.engines import EVERY_AGENCY, whose_rows
 from app.services.decoder_tasks import is_long_task
-from app.services.decodes.frame_tasks import DecodePlates
 from app.services.decodes.trace_tasks import compile_traces
 from app.services.request_work import add_processor_time, check_deadline, current_work
 

@@ -11,12 +11,13 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import product
 from math import comb
-from typing import Annotated
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 from pydantic import Field, SkipValidation, WithJsonSchema, with_config
+from typing_extensions import TypedDict
 
 from app.errors import CodeMismatch, Conflict, InvalidParameter
 from app.inputs import INPUT, Number, Whole
@@ -619,3 +620,52 @@ class Codebook:
         if not all(isinstance(tag, InformationTag) for tag, _ in entries):
             raise CodeMismatch("line tags have no place in a codebook", field="entries", limit="information tags")
         return cls(document.get("name", ""), design, entries)  # type: ignore[arg-type]
+
+
+# === What the row of a magnet marker has in its column `spec`.
+
+
+INFORMATION_TAG: Final = "information-tag"
+
+
+class StoredMeaning(TypedDict):
+    """The kind of a meaning and its value."""
+
+    kind: str
+    value: float | str
+
+
+class StoredLane(TypedDict):
+    """Vertices in WGS 84, and in `given` the coordinates that were sent where they were of another system."""
+
+    points_deg: list[list[float]]
+    height_m: float | None
+    given: list[list[float]] | None
+
+
+class StoredNeighbour(TypedDict):
+    """The nearest magnet of another marker with an orientation."""
+
+    name: str
+    lon_deg: float
+    lat_deg: float
+    phi_deg: int
+
+
+class MagnetSpec(TypedDict):
+    """What the layout of a magnet marker follows from."""
+
+    kind: Literal["information-tag", "line-tag"]
+    tag: str
+    codebook_id: str | None
+    meaning: StoredMeaning | None
+    lane: StoredLane
+    place: dict[str, float | None]  # of `TagPlace` or `LinePlace`
+    site: JsonObject  # of `Site`
+    neighbours: list[StoredNeighbour]
+
+
+def meaning_of(spec: MagnetSpec) -> Meaning | None:
+    """What the tag means, if it is in a codebook."""
+    stored = spec["meaning"]
+    return None if stored is None else Meaning(MeaningKind(stored["kind"]), stored["value"])

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import GetPydanticSchema
 
-from app.geodesy import UNFIT_TEXT, LocalizationGrade
+from app.geodesy import UNFIT_TEXT, LocalizationGrade, grade_accuracy, move_to_epoch, total_accuracy_m
+from app.geodesy.place import Grade
 from app.markers.plate import PlateCode, PlateGeometry
 
 # === Arrays in results, which JSON has as lists.
@@ -26,6 +29,81 @@ Matrix = Annotated[npt.NDArray[np.float64], GetPydanticSchema(lambda _, schema_o
 
 Status = Literal["planned", "built", "surveyed", "active", "suspect", "retired"]
 STATUSES: tuple[Status, ...] = get_args(Status)
+
+
+# === A marker as it is registered.
+
+
+class MarkerRow(NamedTuple):
+    """A marker of any family. `check_digits` to `thickness_mm` are of plates, and None in the rows of other families.
+
+    `original` is the position as it was sent; `spec` is what else a family stores, in the shape that it declares.
+    """
+
+    id: str
+    family: str
+    status: Status
+    scheme: str
+    digits: str
+    check_digits: int | None
+    digits_match_position: bool | None
+    n: int
+    unit_mm: float
+    gap_mm: float
+    thickness_mm: float
+    lon_deg: float
+    lat_deg: float
+    height_m: float | None
+    heading_deg: float | None
+    heading_rmse_deg: float | None
+    crs: str
+    realization: str | None
+    epoch: float | None
+    vertical_datum: str | None
+    horizontal_rmse_m: float | None
+    vertical_rmse_m: float | None
+    survey_method: str | None
+    check_points: int | None
+    surveyor: str | None
+    instrument: str | None
+    survey_file_sha256: str | None
+    transform_accuracy_m: float | None
+    original: dict[str, object]
+    localization_grade: Grade
+    transform_note: str | None
+    road: str | None
+    measure_m: float | None
+    offset_m: float | None
+    spec: Any
+    version: int
+    created_at: datetime
+    updated_at: datetime
+
+
+def horizontal_rmse_m(row: MarkerRow) -> float | None:
+    """What a marker's position is good to: its survey, and the stated bound of what brought it to WGS 84 / ITRF. [m]"""
+    stated, bound_m = row.horizontal_rmse_m, row.transform_accuracy_m
+    return None if stated is None else math.hypot(stated, bound_m or 0.0)
+
+
+def marker_at(row: MarkerRow, epoch: float) -> MarkerRow:
+    """The row with the position that its marker has at an epoch, by the motion of its plate.
+
+    A position without an epoch stays: its accuracy already allows for the motion of ten years.
+
+    Parameters
+    ----------
+    epoch : float
+        [decimal year]
+    """
+    if row.epoch is None or row.transform_accuracy_m is None:
+        return row
+    moved = move_to_epoch(row.lon_deg, row.lat_deg, row.epoch, epoch)
+    accuracy_m = math.hypot(row.transform_accuracy_m, float(moved.accuracy_m[0]))
+    return row._replace(
+        lon_deg=float(moved.lon_deg[0]), lat_deg=float(moved.lat_deg[0]), epoch=epoch, transform_accuracy_m=accuracy_m,
+        localization_grade=grade_accuracy(total_accuracy_m(row.horizontal_rmse_m, accuracy_m)).value,
+    )  # fmt: skip
 
 
 # === Reasons why a marker's position is unfit for localization.
@@ -52,6 +130,11 @@ def position_warnings(what: str, *, grade: str, transform_note: str | None, stat
     if status not in SURVEYED:
         localization_warnings.append(f"the {what} is {status}, its position is not surveyed")
     return localization_warnings
+
+
+def row_warnings(row: MarkerRow, what: str) -> list[str]:
+    """What makes the position of a plate or a tag unfit for localization."""
+    return position_warnings(what, grade=row.localization_grade, transform_note=row.transform_note, status=row.status)
 
 
 # === The result of one design check: its figure, the limit and the limit's source.

@@ -17,10 +17,11 @@ import orjson
 import sqlalchemy as sa
 
 from app.geodesy.systems import ELLIPSOID, is_ellipsoidal
+from app.markers.reading import MarkerRow
 from app.registry.bulk_load import Columns, JsonTexts, json_objects, json_texts
 from app.registry.column_types import AnyColumn, AnySelect
 from app.registry.conditions import Condition, condition_sql
-from app.registry.marker_rows import MarkerRow, markers
+from app.registry.marker_rows import markers
 from app.registry.plan_states import find_plan_states
 from app.registry.spatial import Box, proposed_by_index
 

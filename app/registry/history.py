@@ -9,11 +9,13 @@ from typing import cast
 import sqlalchemy as sa
 
 from app.errors import NotFound
+from app.geodesy.frames import distance_m
+from app.markers.reading import MarkerRow
 from app.registry.column_types import fetch_all, row_of, select_rows
 from app.registry.conditions import is_graded, regraded
-from app.registry.marker_rows import MARKERS, MarkerRow, VersionRow, marker_versions, markers
+from app.registry.marker_rows import MARKERS, VersionRow, marker_versions, markers
 from app.registry.markers import MarkerFilter, conditions_of
-from app.registry.spatial import covers, distance_m
+from app.registry.spatial import covers
 
 MAX_REBUILT = 20_000
 """Markers that changed since are read one by one from their versions: a page looks at no more of them."""

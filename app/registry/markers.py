@@ -14,6 +14,7 @@ import sqlalchemy as sa
 from app.errors import NotFound, StaleVersion
 from app.geodesy.systems import ELLIPSOID
 from app.markers.magnet_design import CODEBOOK_FORMAT, Codebook
+from app.markers.reading import MarkerRow
 from app.registry.agencies import agency_secrets
 from app.registry.audit import AuditEntry, add_versions
 from app.registry.bulk_load import Columns, json_objects, large_load, load_columns
@@ -31,7 +32,7 @@ from app.registry.column_types import (
 )
 from app.registry.engines import seeing_every_agency
 from app.registry.features import feature_text, feature_texts
-from app.registry.marker_rows import MARKERS, CodeRow, MarkerRow, marker_versions, markers
+from app.registry.marker_rows import MARKERS, CodeRow, marker_versions, markers
 from app.registry.resources import Resource
 from app.registry.spatial import (
     Area,

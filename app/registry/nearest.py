@@ -16,9 +16,10 @@ from functools import lru_cache
 import numpy as np
 import sqlalchemy as sa
 
+from app.markers.reading import MarkerRow
 from app.registry.column_types import AnySelect, row_maker
 from app.registry.features import in_box
-from app.registry.marker_rows import PUBLIC, MarkerRow, markers
+from app.registry.marker_rows import PUBLIC, markers
 from app.registry.markers import MarkerFilter, conditions_of
 from app.registry.spatial import Box, box_around, distances_m, within_box
 from app.values import Floats, Ints, JsonObject

@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
+from app.markers.reading import MarkerRow
 from app.registry.bulk_load import Columns, load_columns
 from app.registry.column_types import ID, UtcTime, agency_column, columns_of, fetch_all, metadata
 from app.registry.jobs import UNFINISHED, jobs
-from app.registry.marker_rows import MARKERS, MarkerRow, markers
+from app.registry.marker_rows import MARKERS, markers
 from app.registry.markers import MarkerFilter, conditions_of
 from app.registry.plan_states import plan_markers, plans
 from app.registry.resources import Resource

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
+from app.markers.reading import MarkerRow
 from app.registry.audit import AuditEntry, add_versions
 from app.registry.column_types import ID, UtcTime, agency_column, fetch_all, metadata
 from app.registry.features import feature_text
-from app.registry.marker_rows import MARKERS, MarkerRow, markers
+from app.registry.marker_rows import MARKERS, markers
 from app.registry.resources import Resource
 
 roads = sa.Table(

@@ -11,18 +11,18 @@ import hashlib
 import math
 import sqlite3
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 import sqlalchemy as sa
-from pyproj import Geod
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
+from app.geodesy.frames import distance_m, ellipsoid
 from app.registry.marker_rows import markers
 from app.values import Floats, Floats32, Ints
 
@@ -364,17 +364,7 @@ def distance_to(lon_deg: sa.ColumnElement[float], lat_deg: sa.ColumnElement[floa
 def distances_m(lon_deg: float, lat_deg: float, lons_deg: Floats, lats_deg: Floats) -> Floats:
     """Geodesic distances of positions from one position, shape (N,). [m]"""
     same = np.ones(len(lons_deg))
-    return np.asarray(_ellipsoid().inv(lon_deg * same, lat_deg * same, lons_deg, lats_deg)[2], dtype=np.float64)
-
-
-def distance_m(lon_a_deg: float, lat_a_deg: float, lon_b_deg: float, lat_b_deg: float) -> float:
-    """Geodesic distance on WGS 84. [m]"""
-    return float(_ellipsoid().inv(lon_a_deg, lat_a_deg, lon_b_deg, lat_b_deg)[2])
-
-
-@lru_cache
-def _ellipsoid() -> Geod:
-    return Geod(ellps="WGS84")
+    return np.asarray(ellipsoid().inv(lon_deg * same, lat_deg * same, lons_deg, lats_deg)[2], dtype=np.float64)
 
 
 def register_functions(connection: sqlite3.Connection) -> None:

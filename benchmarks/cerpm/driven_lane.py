@@ -9,8 +9,8 @@ import numpy as np
 
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
+from app.decoding.recordings import packet_strengths
 from app.lanes.estimate import Lane, fit_lane
-from app.services.decodes.matching import packet_strengths
 from app.services.decodes.packet_documents import path_warnings
 from app.simulation.radio.drive import SatelliteReceiver, drive_past
 from benchmarks.cerpm import scenes

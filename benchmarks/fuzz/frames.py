@@ -9,8 +9,8 @@ from concurrent.futures import Future
 from typing import Any
 
 from app.decoders.plate.reader import decode_plates
+from app.decoding.frames import PlateSearch
 from app.errors import WaymarkError
-from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.jobs.pool import DecodePool

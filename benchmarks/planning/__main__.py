@@ -1,6 +1,6 @@
 """``python -m benchmarks.planning [ITEM ...] [--short]``: plans of whole roads.
 
-Items: speed, predictions, optimiser, commit, papers, all. The exit status is 1 where a goal was missed.
+Items: speed, predictions, optimiser, commit, papers, proofs, all. The exit status is 1 where a goal was missed.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from benchmarks.planning.commit import measure_commit
 from benchmarks.planning.optimiser import measure_optimiser
 from benchmarks.planning.papers import measure_papers
 from benchmarks.planning.predictions import measure_predictions
+from benchmarks.planning.proofs import measure_proofs
 from benchmarks.planning.speed import measure_speed
 from benchmarks.planning.tables import Section
 
@@ -22,6 +23,7 @@ RUNS: dict[str, Callable[[bool], Section]] = {
     "optimiser": measure_optimiser,
     "commit": measure_commit,
     "papers": measure_papers,
+    "proofs": measure_proofs,
 }
 
 

@@ -15,11 +15,10 @@ from app.planning.plan import Plan, PlannedLineMagnet, PlannedPlate, PlannedTag
 from app.planning.plan_checks import check_plan
 from app.planning.proof import ProofTerms
 from app.planning.proof.plates import FramesRead, read_frames
-from app.planning.proof.prove import Prover
 from app.planning.proof.report import drive_terms
 from app.planning.rules import PlanRules
 from app.radio.link import LinkModel
-from benchmarks.planning.roads import generated_road
+from benchmarks.planning.roads import generated_road, prover_of
 from benchmarks.planning.tables import Section, table
 
 FIGURE_17A = {
@@ -80,7 +79,7 @@ def _frames_of_paper_plate() -> FramesRead:
     assert isinstance(plate.detail, PlannedPlate)
     paper = replace(plate.detail, code=PlateCode(PLATE_DIGITS, PlateScheme.POSITION))
     marker = replace(plate, detail=paper, code=PLATE_DIGITS)
-    prover = Prover(replace(plan, markers=(marker,)), TERMS)
+    prover = prover_of(replace(plan, markers=(marker,)), TERMS)
     return read_frames(prover.plate_pass(marker, drive_terms(plan, TERMS, 0)))
 
 

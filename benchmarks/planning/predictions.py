@@ -20,10 +20,9 @@ from app.planning.predict.rates import path_errors_m
 from app.planning.proof import ProofTerms, UnitKind, wilson
 from app.planning.proof.drives import drive_cerpms, drive_line, read_tag
 from app.planning.proof.plates import read_frames
-from app.planning.proof.prove import Prover
 from app.planning.proof.report import DriveTerms, drive_terms
 from app.planning.rules import PlanRules
-from benchmarks.planning.roads import LANES, generated_road, real_lane
+from benchmarks.planning.roads import LANES, generated_road, prover_of, real_lane
 from benchmarks.planning.tables import Section, table
 
 GOAL = 0.10
@@ -147,7 +146,7 @@ def _plates_read(plan: Plan, condition: str, camera: str, passes: int) -> tuple[
     plates = [marker for marker in plan.markers if isinstance(marker.detail, PlannedPlate)]
     drives = math.ceil(passes / len(plates))
     terms = ProofTerms(drives=drives, seed=SEED, conditions=(condition,), cameras=(camera,))
-    prover, read, count = Prover(plan, terms), 0, 0
+    prover, read, count = prover_of(plan, terms), 0, 0
     chosen = np.random.default_rng((SEED, len(condition))).permutation(len(plates) * drives)[: max(passes, drives)]
     for drive, k in (divmod(int(one), len(plates)) for one in chosen):
         drive_of: DriveTerms = drive_terms(plan, terms, drive)
@@ -160,7 +159,7 @@ def _plates_read(plan: Plan, condition: str, camera: str, passes: int) -> tuple[
 
 def _tags_read(plan: Plan, passes: int) -> tuple[int, int]:
     tags = [marker for marker in plan.markers if isinstance(marker.detail, PlannedTag)]
-    prover = Prover(plan, ProofTerms(drives=passes, seed=SEED))
+    prover = prover_of(plan, ProofTerms(drives=passes, seed=SEED))
     if not tags:
         return 0, 0
     count = max(passes // 2, 1)
@@ -171,7 +170,7 @@ def _lines_read(plan: Plan, passes: int) -> tuple[int, int]:
     if not any(isinstance(marker.detail, PlannedLineMagnet) for marker in plan.markers):
         return 0, 0
     terms = ProofTerms(drives=max(passes // 10, 1), seed=SEED, max_sections_per_drive=2)
-    prover = Prover(plan, terms)
+    prover = prover_of(plan, terms)
     units = [unit for unit in prover.list_units() if unit.kind is UnitKind.LINE]
     found = [one for unit in units for one in drive_line(prover.line_pass(unit), 1.0)[0]]
     return sum(one["read"] for one in found), len(found)
@@ -179,7 +178,7 @@ def _lines_read(plan: Plan, passes: int) -> tuple[int, int]:
 
 def _path(plan: Plan, drives: int) -> Compared:
     terms = ProofTerms(drives=drives, seed=SEED, max_sections_per_drive=100)
-    prover = Prover(plan, terms)
+    prover = prover_of(plan, terms)
     units = [unit for unit in prover.list_units() if unit.kind is UnitKind.LANE]
     found = [drive_cerpms(prover.lane_pass(unit)) for unit in units]
     measured = math.sqrt(sum(one["square_sum_m2"] for one in found) / sum(one["covered"] for one in found))

@@ -10,9 +10,14 @@ import numpy as np
 import orjson
 from pyproj import Geod
 
+from app.families import rows_of_plan
 from app.formats.alignments.read import read_alignment
 from app.planning.alignment import Alignment
 from app.planning.build_alignment import build_alignment
+from app.planning.plan import Plan
+from app.planning.proof import ProofTerms
+from app.planning.proof.drives import START
+from app.planning.proof.prove import Prover
 from app.planning.rules import RoadRules
 from app.values import Floats
 
@@ -156,3 +161,8 @@ def _boundaries(
 def _point(kind: str, lane: str, place: list[float], value: float | None) -> dict[str, object]:
     properties = {"kind": kind, "lane": lane, **({} if value is None else {"value": value})}
     return {"type": "Feature", "properties": properties, "geometry": {"type": "Point", "coordinates": place}}
+
+
+def prover_of(plan: Plan, terms: ProofTerms) -> Prover:
+    """The prover of a plan, with the rows that its commit stores."""
+    return Prover(plan, terms, rows_of_plan(plan, START))

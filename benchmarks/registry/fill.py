@@ -19,11 +19,12 @@ from app.families.cerpm import CerpmIn
 from app.families.documents import PositionIn
 from app.families.plate.plates import CodeInput, PlateIn
 from app.markers.plate import PlateCode, PlateScheme
+from app.markers.reading import MarkerRow
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.column_types import new_id, row_of
 from app.registry.database import Database
 from app.registry.features import feature_text
-from app.registry.marker_rows import MarkerRow, markers
+from app.registry.marker_rows import markers
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
 from app.values import Floats

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from app.decoding.declarations import CoarsePosition
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 from app.registry.database import Database
@@ -19,7 +20,6 @@ from app.registry.features import FeatureFilter
 from app.registry.markers import MarkerFilter
 from app.registry.spatial import Area, Box
 from app.services.access.access import Access, Caller
-from app.services.decodes.declarations import CoarsePosition
 from app.services.decodes.matching import find_nearby_markers, match_reading
 from app.services.markers.features import MARKERS, Features
 from app.services.markers.searches import Searches

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sa
 
+from app.markers.reading import MarkerRow
 from app.registry.agencies import find_agency
 from app.registry.audit import AuditEntry, ChainReport, audit_log, entry_hash, find_head, list_entries
 from app.registry.bulk_load import load_rows
 from app.registry.column_types import fetch_all
 from app.registry.database import Database
 from app.registry.engines import across_agencies
-from app.registry.marker_rows import MARKERS, MarkerRow, marker_versions, markers
+from app.registry.marker_rows import MARKERS, marker_versions, markers
 from app.services.access.audit import AuditLog
 from app.services.documents import VersionKind
 

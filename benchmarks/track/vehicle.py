@@ -19,7 +19,6 @@ import cv2
 import httpx
 import numpy as np
 
-from app.demo.cerpms import write_packets, write_poses
 from app.encoders.cerpm import encode_message
 from app.geodesy import enu_from_wgs84, wgs84_from_enu
 from app.markers.cerpm import LaneSide
@@ -35,7 +34,7 @@ from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene
-from app.simulation.radio.drive import Drive, SatelliteReceiver, drive_past, observe_track
+from app.simulation.radio.drive import Drive, SatelliteReceiver, drive_past, observe_track, write_packets, write_poses
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_between
 from app.simulation.radio.link import Radio
 from app.values import Floats

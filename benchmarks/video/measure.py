@@ -13,7 +13,7 @@ import numpy as np
 from app.decoders.plate.accumulate import MAX_ODD_UNITS
 from app.decoders.plate.unit_likelihoods import LARGE_UNIT_PX, code_units
 from app.decoders.plate.video_search import FoundPlate
-from app.families.plate.frames import PlateSearch
+from app.decoding.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.video_file import VideoFile, VideoKind

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 
 from app.decoders.plate.reader import decode_plates
-from app.families.plate.frames import PlateSearch
+from app.decoding.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.video_file import VideoFile, VideoKind

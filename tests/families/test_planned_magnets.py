@@ -6,9 +6,10 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import cast
 
-from app.families.magnet.layouts import MAX_MAGNETS, MagnetSpec, site_of
+from app.families.magnet.layouts import MAX_MAGNETS, site_of
 from app.families.magnet.magnets import MAGNET
 from app.families.surveys import Commitment, MarkerRules
+from app.markers.magnet_design import MagnetSpec
 from app.planning.placement import place_plan
 from app.planning.rules import PlanRules
 from tests.planning.roads import road, straight

@@ -16,8 +16,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from app.decoding.frames import PlateSearch
 from app.errors import InvalidParameter, ProcessStopped, Unavailable, UnreadableUpload
-from app.families.plate.frames import PlateSearch
 from app.formats.format import SpooledFile
 from app.jobs import decoder_process
 from app.jobs import pool as supervisor

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.families.plate.frames import PlateSearch
+from app.decoding.frames import PlateSearch
 from app.formats.format import SpooledFile
 from app.jobs import decoder_process
 from app.jobs.decoder_process import ProcessLimits

@@ -23,8 +23,8 @@ def test_the_published_schema_is_the_generated_one() -> None:
     assert schema["additionalProperties"] is False
 
 
-def test_there_are_three_examples_and_they_are_read() -> None:
-    assert len(EXAMPLES) == 3
+def test_there_are_four_examples_and_they_are_read() -> None:
+    assert len(EXAMPLES) == 4
     rules = {path.stem: read_rules(path.read_bytes()) for path in EXAMPLES}
     assert rules["rules-rural-plates"].plates is not None
     assert rules["rules-city-magnets"].tags is not None

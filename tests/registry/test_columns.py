@@ -8,11 +8,11 @@ from typing import Any
 import orjson
 import pytest
 
+from app.markers.reading import MarkerRow
 from app.registry.audit import AuditEntry, version_sha256
 from app.registry.bulk_load import Columns, JsonTexts, json_objects
 from app.registry.column_types import new_ids, row_of
 from app.registry.features import feature_text, feature_texts
-from app.registry.marker_rows import MarkerRow
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)
 AWKWARD = ("", "plain", "a, b", '"%s" 100 %', "back\\slash\n", "Straße 日本", "null", "\x7f\u2028")

@@ -13,6 +13,7 @@ import orjson
 import pytest
 import sqlalchemy as sa
 
+from app.markers.reading import MarkerRow
 from app.registry.audit import ChainReport, check_history, find_head, version_sha256
 from app.registry.bulk_load import load_rows
 from app.registry.column_types import row_of
@@ -20,7 +21,7 @@ from app.registry.conditions import regraded
 from app.registry.database import Database
 from app.registry.features import feature_text
 from app.registry.history import list_versions
-from app.registry.marker_rows import MarkerRow, markers
+from app.registry.marker_rows import markers
 from app.registry.markers import MarkerFilter, list_magnets_in, list_markers
 from app.registry.spatial import Box
 from app.registry.tables import metadata

@@ -22,11 +22,11 @@ from app.api.http.responses import (
     page_response,
 )
 from app.api.http.routes import Router
+from app.decoding.declarations import CONTEXT_EXAMPLE, UploadContext
 from app.inputs import Identifier, Text, Time
 from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobState
 from app.services.decodes.context import DecodeKind
-from app.services.decodes.declarations import CONTEXT_EXAMPLE, UploadContext
 from app.services.decodes.decodes import DecodeDetails, PacketsDocument
 from app.services.decodes.decodes import Decodes as DecodesService
 from app.services.decodes.documents import DecodeDocument, DecodePage

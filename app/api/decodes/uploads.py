@@ -27,9 +27,9 @@ from app.api.http.dependencies import caller_of
 from app.api.http.problems import BodyRefused
 from app.api.http.responses import IdempotencyKeyHeader
 from app.api.http.strict_json import validated
+from app.decoding.declarations import UploadContext
 from app.errors import MalformedRequest, QuotaExceeded, UnreadableUpload, UnsupportedUpload
 from app.formats.format import SpooledFile
-from app.services.decodes.declarations import UploadContext
 from app.services.idempotency import IdempotencyKey
 from app.services.uploads.quotas import Quotas
 

@@ -10,12 +10,11 @@ from typing_extensions import TypedDict
 from app.encoders.magnet import DrillingSheet
 from app.encoders.magnet.sheets import sheet_document
 from app.families.documents import MarkerDocument, marker_head, marker_place
-from app.families.magnet.layouts import LinePlace, MagnetSpec, StoredMeaning, TagPlace, meaning_of, site_of
+from app.families.magnet.layouts import LinePlace, TagPlace, site_of
 from app.markers.magnet import LineStyle, LineTag, parse_tag
-from app.markers.magnet_design import Meaning
-from app.markers.reading import Check
+from app.markers.magnet_design import MagnetSpec, Meaning, StoredMeaning, meaning_of
+from app.markers.reading import Check, MarkerRow
 from app.planning.magnet_checks import Site
-from app.registry.marker_rows import MarkerRow
 from app.values import JsonObject
 
 

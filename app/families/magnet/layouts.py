@@ -10,7 +10,6 @@ from typing import Annotated, Final, Literal
 import orjson
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 from pyproj import Geod
-from typing_extensions import TypedDict
 
 from app.encoders.magnet import DrillingSheet, MagnetLayout, place_line, place_tag
 from app.errors import InvalidParameter, naming
@@ -18,12 +17,10 @@ from app.families.documents import Height, MarkerIn, Metres, ProvenanceIn
 from app.geodesy import PlacedPosition, place_position
 from app.inputs import Identifier, Number, StrictModel, Text
 from app.markers.magnet import InformationTag, LineStyle, LineTag, Orientation, parse_tag
-from app.markers.magnet_design import Meaning, MeaningKind
-from app.markers.reading import Check
+from app.markers.magnet_design import MagnetSpec, Meaning, StoredLane, meaning_of
+from app.markers.reading import Check, MarkerRow
 from app.planning.magnet_checks import Neighbour, Site, drilling_sheet
-from app.registry.marker_rows import MarkerRow
 from app.roads.lane_line import LaneLine
-from app.values import JsonObject
 
 # === Requests that register magnet markers.
 
@@ -178,56 +175,9 @@ class MagnetIn(MarkerIn):
         return 1 + math.ceil(min(max(count, 0.0), MAX_MAGNETS))
 
 
-# === What the row of a magnet marker has in its column `spec`.
-
-
-class StoredMeaning(TypedDict):
-    """The kind of a meaning and its value."""
-
-    kind: str
-    value: float | str
-
-
-class StoredLane(TypedDict):
-    """Vertices in WGS 84, and in `given` the coordinates that were sent where they were of another system."""
-
-    points_deg: list[list[float]]
-    height_m: float | None
-    given: list[list[float]] | None
-
-
-class StoredNeighbour(TypedDict):
-    """The nearest magnet of another marker with an orientation."""
-
-    name: str
-    lon_deg: float
-    lat_deg: float
-    phi_deg: int
-
-
-class MagnetSpec(TypedDict):
-    """What the layout of a magnet marker follows from."""
-
-    kind: Literal["information-tag", "line-tag"]
-    tag: str
-    codebook_id: str | None
-    meaning: StoredMeaning | None
-    lane: StoredLane
-    place: dict[str, float | None]  # of `TagPlace` or `LinePlace`
-    site: JsonObject  # of `Site`
-    neighbours: list[StoredNeighbour]
-
-
-def meaning_of(spec: MagnetSpec) -> Meaning | None:
-    """What the tag means, if it is in a codebook."""
-    stored = spec["meaning"]
-    return None if stored is None else Meaning(MeaningKind(stored["kind"]), stored["value"])
-
-
 # === A magnet marker's layout.
 
 
-INFORMATION_TAG: Final = "information-tag"
 LINE_TAG: Final = "line-tag"
 _LAID_OUT: Final = ("lane", "tag", "place", "meaning")
 MAX_RESURVEY_M = 1.0

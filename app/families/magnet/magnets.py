@@ -17,7 +17,6 @@ from app.families.documents import position_columns
 from app.families.family import Family, Registration
 from app.families.magnet.documents import MagnetDetailDocument, MagnetDocument, magnet_detail, magnet_document
 from app.families.magnet.layouts import (
-    INFORMATION_TAG,
     LINE_TAG,
     MAGNET_EXAMPLES,
     MAX_MAGNETS,
@@ -25,7 +24,6 @@ from app.families.magnet.layouts import (
     LineIn,
     LineStringIn,
     MagnetIn,
-    MagnetSpec,
     TagIn,
     check_never_broken,
     lane_spec,
@@ -37,14 +35,15 @@ from app.families.magnet.layouts import (
 )
 from app.families.surveys import PLAN_METHOD, ColumnValues, Commitment, MarkerRules, PlannedRow, is_placed_again
 from app.markers.magnet import MIN_GAP_M, InformationTag, LineStyle, LineTag, Orientation, Tag, parse_tag
-from app.markers.magnet_design import Meaning
+from app.markers.magnet_design import INFORMATION_TAG, MagnetSpec, Meaning
+from app.markers.reading import MarkerRow
 from app.planning.magnet_checks import HALF_BAR_M, Neighbour
 from app.planning.magnet_stretches import even_stretches, lane_around, spacing_of
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedLineMagnet, PlannedMarker, PlannedTag
 from app.registry.column_types import new_id
 from app.registry.lines import MagnetLines
-from app.registry.marker_rows import MarkerRow, markers
+from app.registry.marker_rows import markers
 from app.registry.markers import CODEBOOKS, MagnetRow, book_of, list_magnets_in, replace_magnets
 from app.registry.spatial import Box, box_around
 from app.roads.lane_line import LaneLine, bearing_deg

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
-from app.errors import NotFound
-from app.families.family import (
-    ApproximatePosition,
-    FrameReader,
+from app.decoding.declarations import CoarsePosition
+from app.decoding.frames import (
+    DecodePlates,
     Match,
     Nearby,
     Pixels,
+    PlateSearch,
+    decode_plates,
     distance_to_row,
-    nearest_match,
-    rounded,
+    match_plate,
+    read_plates,
+    search_plates,
 )
+from app.errors import NotFound
+from app.families.family import FrameReader, rounded
+from app.geodesy.frames import distance_m
 from app.markers.plate import (
-    EXPECTED_GEOMETRIES,
     PlateCode,
-    PlateGeometry,
     PlateScheme,
     ResolvedPosition,
     decimal_codes,
@@ -33,40 +36,14 @@ from app.markers.plate import (
 )
 from app.markers.reading import PlateGrade, PlatePose, PlateReading
 from app.registry import markers as store
-from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter
-from app.registry.spatial import distance_m
 from app.sensors.camera import Camera
-
-# === The row of a plate as values of the core.
-
-
-def plate_code(row: MarkerRow) -> PlateCode:
-    """Code of a plate's row."""
-    return PlateCode(row.digits, PlateScheme(row.scheme), row.n, row.check_digits or 1)
-
-
-def plate_geometry(row: MarkerRow) -> PlateGeometry:
-    """Geometry of a plate's row."""
-    return PlateGeometry(row.n, row.unit_mm, row.gap_mm, row.thickness_mm)
-
 
 # === Plates in camera frames.
 
 
 _MAX_ELSEWHERE = 500
 _M_PER_DEG = 111_000.0
-
-
-@dataclass(frozen=True, slots=True)
-class PlateSearch:
-    """What to look for in a frame."""
-
-    camera: Camera | None = None
-    # plates that the registry knows nearby
-    codebook: tuple[PlateCode, ...] = ()  # plates that the registry knows nearby
-    # dimensions to look for; the decoder's own where there are none
-    geometries: tuple[PlateGeometry, ...] = ()  # dimensions to look for; the decoder's own where there are none
 
 
 class ReadGeometryDocument(TypedDict):
@@ -120,13 +97,6 @@ class PlateReadingDocument(TypedDict):
     pose: PlatePose | None
 
 
-def decode_plates(pixels: Pixels, **options: Any) -> list[PlateReading]:
-    """As `app.decoders.plate.reader.decode_plates`, which is loaded with the first frame: a server decodes none."""
-    from app.decoders.plate import reader
-
-    return reader.decode_plates(pixels, **options)
-
-
 class PlateFrames(FrameReader[PlateReading, PlateSearch]):
     """Reads plates in frames.
 
@@ -138,25 +108,23 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
 
     document_type = PlateReadingDocument
 
-    def __init__(self, decode: Callable[..., list[PlateReading]] = decode_plates) -> None:
+    def __init__(self, decode: DecodePlates = decode_plates) -> None:
         self._decode = decode
 
     def search(self, nearby: Nearby, camera: Camera | None) -> PlateSearch:
         """The codes nearby, and their dimensions beside the usual ones."""
-        geometries = _distinct([*EXPECTED_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)])
-        return PlateSearch(camera, plate_codebook(nearby), geometries)
+        return search_plates(nearby, camera)
 
     def read(self, pixels: Pixels, search: PlateSearch, *, thermal: bool) -> Sequence[PlateReading]:
         """Decode the plates of a frame."""
-        options = {"geometries": search.geometries} if search.geometries else {}
-        return self._decode(pixels, camera=search.camera, codebook=search.codebook, thermal=thermal, **options)
+        return read_plates(pixels, search, self._decode, thermal=thermal)
 
     def match(
         self,
         connection: sa.Connection,
         agency_id: str,
         reading: PlateReading,
-        position: ApproximatePosition | None,
+        position: CoarsePosition | None,
         nearby: Nearby,
     ) -> Match | None:
         """The registered plate with the digits that were read, nearest to the approximate position.
@@ -169,13 +137,13 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
         code = reading.code
         if code is None or position is None:
             return None
-        rows = [row for row in nearby.rows if _carries(row, code)]
+        match = match_plate(nearby, code, position)
         if not nearby.complete:
             around = MarkerFilter(near=(position.lon_deg, position.lat_deg, position.reach_m), digits=code.digits)
             found = store.list_markers(connection, agency_id, around, after=None, limit=_MAX_ELSEWHERE)
-            rows = [row for row in found if row.status != "retired" and _carries(row, code)]
-        if rows:
-            return nearest_match(rows, position, "plate")
+            match = match_plate(Nearby(tuple(row for row in found if row.status != "retired")), code, position)
+        if match is not None:
+            return match
         if code.scheme is PlateScheme.ID:
             return _match_elsewhere(connection, agency_id, code, position)
         return _resolve_unregistered(code, position)
@@ -222,26 +190,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
         }
 
 
-def plate_codebook(nearby: Nearby) -> tuple[PlateCode, ...]:
-    """Codes of the plates nearby, without repetitions; none if not all of them are known."""
-    return tuple(dict.fromkeys(plate_code(row) for row in nearby.rows)) if nearby.complete else ()
-
-
-def _distinct(geometries: Sequence[PlateGeometry]) -> tuple[PlateGeometry, ...]:
-    """The geometries without repetitions; thickness does not show in a frame."""
-    seen: dict[tuple[int, float, float], PlateGeometry] = {}
-    for geometry in geometries:
-        seen.setdefault((geometry.n, geometry.unit_mm, geometry.gap_mm), geometry)
-    return tuple(seen.values())
-
-
-def _carries(row: MarkerRow, code: PlateCode) -> bool:
-    return row.digits == code.digits and row.n == code.n
-
-
-def _match_elsewhere(
-    connection: sa.Connection, agency_id: str, code: PlateCode, position: ApproximatePosition
-) -> Match:
+def _match_elsewhere(connection: sa.Connection, agency_id: str, code: PlateCode, position: CoarsePosition) -> Match:
     """An id plate names itself wherever it is: one far from its place was moved or copied."""
     known = store.find_id_code(connection, code.digits, code.n)
     try:
@@ -261,7 +210,7 @@ def _possible_codes(code: PlateCode) -> tuple[PlateCode, ...]:
     return (code,) if code.scheme.corrects else decimal_codes(code.symbols, code.n)
 
 
-def _resolve_unregistered(code: PlateCode, position: ApproximatePosition) -> Match:
+def _resolve_unregistered(code: PlateCode, position: CoarsePosition) -> Match:
     """Where the digits place a plate: under the scheme with most check digits of those that place it within reach."""
     codes = _possible_codes(code)
     places = [resolve_position(one, position.lon_deg, position.lat_deg) for one in codes]
@@ -276,7 +225,7 @@ def _resolve_unregistered(code: PlateCode, position: ApproximatePosition) -> Mat
     return replace(match, note=f"{match.note}; otherwise it is {apart_m:.1f} m away")
 
 
-def _match_at(code: PlateCode, resolved: ResolvedPosition, position: ApproximatePosition) -> Match:
+def _match_at(code: PlateCode, resolved: ResolvedPosition, position: CoarsePosition) -> Match:
     away_m = distance_m(position.lon_deg, position.lat_deg, resolved.lon_deg, resolved.lat_deg)
     next_m = resolved.next_distance_deg * _M_PER_DEG * math.cos(math.radians(position.lat_deg))
     plausible = away_m <= position.reach_m

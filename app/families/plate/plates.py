@@ -16,6 +16,7 @@ import sqlalchemy as sa
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from typing_extensions import TypedDict
 
+from app.decoding.frames import plate_code, plate_geometry
 from app.encoders.plate import ArtworkOptions, Drawing, PlateOrder, PlateReader, encode_plate, prove_plate
 from app.encoders.plate.bundle import ARTWORK_VERSION
 from app.encoders.plate.face import reference_text
@@ -32,7 +33,7 @@ from app.families.documents import (
     position_columns,
 )
 from app.families.family import ArtworkProof, Family, Registration, map_point
-from app.families.plate.frames import PlateFrames, plate_code, plate_geometry
+from app.families.plate.frames import PlateFrames
 from app.families.surveys import (
     PLANNED,
     RETIRED,
@@ -49,6 +50,7 @@ from app.families.surveys import (
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.geodesy import UNFIT_TEXT, PlacedPosition
+from app.geodesy.frames import distance_m
 from app.inputs import Number, StrictModel, Text, Whole
 from app.markers.plate import (
     RECOMMENDED_SCHEME,
@@ -61,12 +63,12 @@ from app.markers.plate import (
     recommended_geometry,
     registry_number_bits,
 )
+from app.markers.reading import MarkerRow
 from app.planning.outputs.hd_map import MapMarker
 from app.planning.plan import PlannedMarker, PlannedPlate
 from app.registry import markers as store
 from app.registry.bulk_load import Columns
-from app.registry.marker_rows import CodeRow, MarkerRow
-from app.registry.spatial import distance_m
+from app.registry.marker_rows import CodeRow
 from app.surveys.georeference import GeoreferencedSurvey
 from app.values import Bools
 

@@ -228,9 +228,8 @@ def _by_cycle(lane: Lane, rules: CerpmRules, cycle_m: float, curve_radius_m: flo
     straight_m, curve_m = rules.straight * cycle_m, rules.curve * cycle_m
     reach = max(round(_BEND_REACH_M / lane.step_m), 1)
     taper = np.abs(np.gradient(lane.width_m, lane.chainage_m)) > _TAPER
-    close = (
-        np.convolve((np.abs(lane.curvature_per_m) > 1 / curve_radius_m) | taper, np.ones(2 * reach + 1), "same") > 0.5
-    )
+    bends = (np.abs(lane.curvature_per_m) > 1 / curve_radius_m) | taper
+    close = scipy.ndimage.maximum_filter1d(bends.astype(np.int8), 2 * reach + 1, mode="constant") > 0
     density = np.where(close, 1 / min(curve_m, straight_m), 1 / straight_m)
     steps = np.diff(lane.chainage_m) * (density[1:] + density[:-1]) / 2
     count = np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,36 +1,119 @@
-"""Simulated drives of a proof over magnets and past CERPMs."""
+"""Simulated drives of a proof over magnets and past CERPMs.
+
+A drive becomes the files that a vehicle uploads. They are read and decoded by the functions that decode uploads
+(`app.decoding`), with the rows of the plan's markers as the registry has them after the commit and the survey. What
+else is known of a drive, such as the lane that it follows, is only used to judge the result.
+"""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import lru_cache
 
 import numpy as np
 import scipy
 
-from app.decoders.cerpm.merge import RegisteredMarker, merge_markers
-from app.decoders.cerpm.verify import verify_packets
-from app.decoders.magnet.decoder import decode_trace
-from app.decoders.magnet.identify import RegisteredTag, TagFormat, match_tags, tag_candidates
+from app.decoders.magnet.identify import ReadTrace, TagFormat
 from app.decoders.magnet.readings import MagnetReading
+from app.decoding.declarations import CoarsePosition, DeclaredPackets, DeclaredTrace
+from app.decoding.recordings import (
+    KnownMarkers,
+    NearbyTags,
+    estimate_path,
+    find_magnets,
+    lane_markers,
+    packet_strengths,
+    read_drive_files,
+    read_packets_of,
+    side_of,
+    speed_limit_of,
+)
 from app.encoders.cerpm import encode_message
-from app.geodesy import enu_from_wgs84, grade_accuracy, wgs84_from_enu
-from app.lanes.estimate import Lane as LanePathEstimate
-from app.lanes.estimate import LaneMarkers, fit_lane
-from app.markers.cerpm import DEGREE_STEP, CerpmMessage, LaneSide, derive_marker_key
+from app.formats.format import SpooledFile
+from app.formats.traces.read import read_trace
+from app.geodesy import (
+    decimal_year,
+    enu_from_wgs84,
+    grade_accuracy,
+    total_accuracy_m,
+    wgs84_from_enu,
+)
+from app.lanes.types import Lane as LaneEstimate
+from app.markers.cerpm import CerpmMessage, LaneSide, derive_marker_key
 from app.markers.magnet import Orientation
+from app.markers.reading import MarkerRow
 from app.planning.alignment import Lane
 from app.planning.plan import PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedTag
 from app.planning.proof.report import LanePath, MarkerPass, WrongReading
 from app.radio.settings import RadioSettings
+from app.sensors.magnetometer_bar import BarDeclaration
 from app.simulation.magnetic.drive import Course, Scene, SimulatedDrive, TrueMagnet, Vehicle, simulate_drive
+from app.simulation.magnetic.recorder import write_tables
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, tag_magnets
-from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_past
+from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_past, write_packets, write_poses
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, lane_from_wgs84
 from app.simulation.radio.link import Radio
 from app.values import Floats
+
+# === The rows of a plan's markers after they were surveyed, and the time of the drives.
+
+
+START = datetime(2026, 6, 2, 8, tzinfo=UTC)
+"""When drives begin."""
+EPOCH = decimal_year(START)
+HEADING_RMSE_DEG = 0.1
+"""[deg] of a plate's surveyed direction. Source: assumed, 0.5 mm across its side."""
+COARSE_M = 20.0
+"""[m] accuracy of a vehicle's coarse position. Source: assumed, between streets and buildings."""
+RADIUS_95 = 2.4477  # standard deviations of each axis in the radius that contains 95 %
+_MIN_RMSE_M = 1e-3  # [m] of a survey, so that its weight is finite
+
+
+def surveyed_row(
+    row: MarkerRow, rmse_m: float, rng: np.random.Generator, off_m: Sequence[float] = (0.0, 0.0)
+) -> MarkerRow:
+    """The row of a planned marker after a survey with RTK.
+
+    Parameters
+    ----------
+    rmse_m : float
+        Of both axes together, as the registry has it. [m]
+    off_m : sequence of float, shape (2,)
+        East and north of the marker from its planned place. [m]
+    """
+    found_m = np.array([*rng.normal(off_m, rmse_m / math.sqrt(2)), 0.0])
+    lon_deg, lat_deg, _height = wgs84_from_enu(found_m, (row.lon_deg, row.lat_deg, row.height_m or 0.0))
+    stated_m = max(rmse_m, _MIN_RMSE_M)
+    if row.family == "plate" and row.heading_deg is not None:  # that of a tag follows from its lane
+        heading_deg = (row.heading_deg + float(rng.normal(0, HEADING_RMSE_DEG))) % 360.0
+        row = row._replace(heading_deg=heading_deg, heading_rmse_deg=HEADING_RMSE_DEG)
+    return row._replace(
+        status="surveyed", lon_deg=lon_deg, lat_deg=lat_deg, realization="ITRF2014", epoch=EPOCH,
+        horizontal_rmse_m=stated_m, vertical_rmse_m=stated_m, survey_method="GNSS RTK", transform_accuracy_m=0.0,
+        localization_grade=grade_accuracy(total_accuracy_m(stated_m, 0.0)).value, transform_note=None,
+    )  # fmt: skip
+
+
+def coarse_position(lon_deg: float, lat_deg: float, rng: np.random.Generator) -> CoarsePosition:
+    """Where a vehicle at a place takes itself to be."""
+    error_m = np.array([*rng.normal(0, COARSE_M / RADIUS_95, 2), 0.0])
+    lon, lat, _height = wgs84_from_enu(error_m, (lon_deg, lat_deg, 0.0))
+    return CoarsePosition(lon_deg=lon, lat_deg=lat, accuracy_m=COARSE_M)
+
+
+def pack(files: Mapping[str, bytes | str]) -> SpooledFile:
+    """Files of a drive as a ZIP that is uploaded."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return SpooledFile.of(packed.getvalue())
+
 
 # === A drive past the CERPMs of a stretch of lane: packets, the path that follows from them, and its errors.
 
@@ -48,7 +131,6 @@ PLACING_SD_M = 0.01
 _KEY = bytes(range(16))  # of the simulated agency; the proof needs authentic packets, not secret ones
 _STEP_M = 1.0  # [m] between points of a boundary; source: the alignment's own step
 _MAX_JITTER = 0.45  # source: `Radio` needs less than half
-_MIN_ACCURACY_M = 1e-3  # [m] of a survey, so that its weight is finite
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +143,8 @@ class LanePass:
     to_m: float
     # [m] CERPMs within reach of the radio, with chainage and offset on the lane; missing ones are left out
     markers: Sequence[tuple[PlannedMarker, float, float]]
-    # registry numbers of those that are registered on the boundaries of the lane: the path is fitted to them
+    rows: Mapping[int, MarkerRow]  # of all planned CERPMs, by their numbers in the plan
+    # registry numbers of those on the boundaries of the lane, by which the path is judged
     own: frozenset[int]
     radio: Radio
     speed_m_s: float
@@ -70,24 +153,23 @@ class LanePass:
 
 
 def drive_cerpms(one: LanePass) -> LanePath:
-    """Drive, verify and merge the packets, fit the lane's path, and compare it with the true centre line."""
+    """Drive, decode what was received as the server decodes an upload, and compare the path with the centre line."""
     low, high = max(one.from_m - BEYOND_M, 0.0), min(one.to_m + BEYOND_M, one.lane.length_m)
     true = true_lane(one.lane, low, high)
-    installed = install(one, true, low)
+    installed, rows = install(one, true, low)
     simulated = drive_past(
         true, installed, one.rng, sign=_sign, radio=one.radio, driver=Driver(speed_m_s=one.speed_m_s),
-        receiver=SatelliteReceiver.rtk(),
+        receiver=SatelliteReceiver.rtk(), start_s=START.timestamp(),
     )  # fmt: skip
-    registered = _registered(installed, one.survey_rmse_m)
-    verified = verify_packets(simulated.packets, {int(number): _key_of(int(number)) for number in installed.number})
-    merged = merge_markers(verified.packets, registered, simulated.track)
-    at = dict(zip(installed.number.tolist(), installed.chainage_m.tolist(), strict=True))
-    used = np.array([n in one.own and 0.0 <= at[n] <= high - low for n in merged.number.tolist()], bool)
-    columns = (merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh)
-    path = fit_lane(LaneMarkers(*(column[used] for column in columns)), simulated.track)
+    declared = DeclaredPackets()
+    upload = pack({"packets.jsonl": write_packets(simulated.packets), "poses.csv": write_poses(simulated.track)})
+    files = read_drive_files("drive.zip", upload, declared)
+    known = KnownMarkers({n: rows[n] for n in files.numbers if n in rows}, _KEY, {}, last_span=0)
+    read = read_packets_of(files, known, declared, received_at=START, observed_at=START)
+    path = estimate_path(lane_markers(read.merged), packet_strengths(read.verification), files.track, declared)
     inside = np.isin(installed.number, list(one.own))
     inside &= (installed.chainage_m + low >= one.from_m) & (installed.chainage_m + low <= one.to_m)
-    received = np.isin(installed.number[inside], merged.number)
+    received = np.isin(installed.number[inside], read.merged.number)
     return judge_path(path, true, one, low, (int(received.sum()), int(inside.sum())))
 
 
@@ -110,30 +192,29 @@ def true_lane(lane: Lane, from_m: float, to_m: float) -> TrueLane:
     return lane_from_wgs84(left, right)
 
 
-def install(one: LanePass, true: TrueLane, low_m: float) -> InstalledMarkers:
-    """The stretch's markers, placed within a centimetre and surveyed."""
-    lon = np.array([marker.lon_deg for marker, _, _ in one.markers])
-    lat = np.array([marker.lat_deg for marker, _, _ in one.markers])
-    count = len(one.markers)
-    point = true.enu_from_wgs84(lon, lat) + one.rng.normal(0, PLACING_SD_M, (count, 2))
-    survey = one.rng.normal(0, one.survey_rmse_m / math.sqrt(2), (count, 2))
-    surveyed_lon, surveyed_lat = true.wgs84_from_enu(point + survey)
-    details = [_planned(marker) for marker, _, _ in one.markers]
-    return InstalledMarkers(
-        number=np.array([detail.number for detail in details], np.int64),
+def install(one: LanePass, true: TrueLane, low_m: float) -> tuple[InstalledMarkers, dict[int, MarkerRow]]:
+    """The stretch's markers, placed within a centimetre, and their rows after the survey, by registry number."""
+    planned = [marker for marker, _, _ in one.markers]
+    lon, lat = (np.array([getattr(marker, name) for marker in planned]) for name in ("lon_deg", "lat_deg"))
+    off_m = one.rng.normal(0, PLACING_SD_M, (len(planned), 2))
+    rows = [
+        surveyed_row(one.rows[marker.number], one.survey_rmse_m, one.rng, off)
+        for marker, off in zip(planned, off_m.tolist(), strict=True)
+    ]
+    installed = InstalledMarkers(
+        number=np.array([int(row.digits) for row in rows], np.int64),
         side=np.array([int(LaneSide.LEFT if left > 0 else LaneSide.RIGHT) for _, _, left in one.markers], np.int64),
         chainage_m=np.array([at - low_m for _, at, _ in one.markers]),
-        point_m=point,
-        lon_deg=np.round(surveyed_lon / DEGREE_STEP) * DEGREE_STEP,
-        lat_deg=np.round(surveyed_lat / DEGREE_STEP) * DEGREE_STEP,
-        broadcast_side=np.array([int(detail.side) for detail in details], np.int64),
-        speed_limit=details[0].speed_limit if details else None,
+        point_m=true.enu_from_wgs84(lon, lat) + off_m,
+        lon_deg=np.array([row.lon_deg for row in rows]),
+        lat_deg=np.array([row.lat_deg for row in rows]),
+        broadcast_side=np.array([int(side_of(row)) for row in rows], np.int64),
+        speed_limit=speed_limit_of(rows[0]) if rows else None,
     )
+    return installed, {int(row.digits): row for row in rows}
 
 
-def judge_path(
-    path: LanePathEstimate, true: TrueLane, one: LanePass, low_m: float, received: tuple[int, int]
-) -> LanePath:
+def judge_path(path: LaneEstimate, true: TrueLane, one: LanePass, low_m: float, received: tuple[int, int]) -> LanePath:
     """Distances of the true centre line's places from the path, between the first and the last marker."""
     ends = [at - low_m for marker, at, _ in one.markers if _planned(marker).number in one.own] or [0.0]
     inside = (true.chainage_m >= max(one.from_m - low_m, min(ends))) & (
@@ -141,8 +222,8 @@ def judge_path(
     )
     result = LanePath(
         places=int(inside.sum()), covered=0, square_sum_m2=0.0, worst_m=0.0, worst_at_m=one.from_m,
-        received=received[0], markers=received[1], left_out=sorted({out.number for out in path.left_out}),
-        refusal=path.refusal,
+        received=received[0], markers=received[1],
+        left_out=sorted({out.number for out in path.left_out} & one.own), refusal=path.refusal,
     )  # fmt: skip
     if path.refusal is not None or len(path.lon_deg) < 2 or not inside.any():
         return result
@@ -171,16 +252,6 @@ def distances_m(places_m: Floats, line_m: Floats) -> Floats:
     return away
 
 
-def _registered(installed: InstalledMarkers, rmse_m: float) -> dict[int, RegisteredMarker | None]:
-    sigma_m = max(rmse_m / math.sqrt(2), _MIN_ACCURACY_M)
-    return {
-        int(number): RegisteredMarker(float(lon), float(lat), side=LaneSide(int(side)), sigma_m=sigma_m)
-        for number, lon, lat, side in zip(
-            installed.number, installed.lon_deg, installed.lat_deg, installed.broadcast_side, strict=True
-        )
-    }
-
-
 @lru_cache(maxsize=200_000)
 def _key_of(number: int) -> bytes:
     return derive_marker_key(_KEY, number)
@@ -198,6 +269,8 @@ def _planned(marker: PlannedMarker) -> PlannedCerpm:
 # === Drives of a bar of magnetometers over magnets of the plan: an information tag, or a stretch of a painted line.
 
 
+FORWARD_M = 3.2
+"""[m] of the bar ahead of the rear axle. Source: `Vehicle.compact`."""
 LEAD_M, TAIL_M = 60.0, 20.0
 """[m] driven before and after. Source: benchmarks/magnets/scenes.py."""
 UNDER_CM = 88.0
@@ -209,7 +282,7 @@ _TAG_REACH_M = 1.0  # [m] of a tag's reading from its first magnet; source: app/
 _WEAVE_M = 0.1  # [m] source: app/demo/magnets.py, between the 0.05 m of the benchmarks and its 0.12 m
 _CURVED_PER_M = 1e-5  # [1/m] below it a road is straight; 100 km of radius
 _SLOWER = 0.5  # of the speed, to find out whether speed is the cause
-_HEADING_STD_DEG = 0.1  # [deg] of a tag's surveyed direction; source: TAG_BEARING_STD_DEG of the decoder
+_TAG_ALONG_M = 5.0  # [m] of a tag's first magnet by the odometer, which is off by a share of the way
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,11 +295,13 @@ class MagnetPass:
     to_m: float
     tag: PlannedMarker | None  # the tag that is driven over
     lines: Sequence[tuple[PlannedMarker, float, float]]  # [m] line magnets nearby with chainage and offset on this lane
-    nearby: Sequence[PlannedMarker]  # tags that the vehicle looks for
+    nearby: Sequence[PlannedMarker]  # tags on the lane nearby
+    position: CoarsePosition  # of the vehicle when the recording begins
+    rows: Sequence[MarkerRow]  # of the magnet markers within reach of that position, after the survey
+    formats: tuple[TagFormat, ...]  # of the codebook
     left_m: float  # [m] of the vehicle from the lane's centre
     speed_m_s: float
     clearance_m: float
-    survey_rmse_m: float
     seed: tuple[int, ...]
     bends: bool = True
 
@@ -267,10 +342,9 @@ def drive_tag(one: MagnetPass, weight: float) -> tuple[MarkerPass, list[WrongRea
 def drive_line(one: MagnetPass, weight: float) -> tuple[list[MarkerPass], list[WrongReading]]:
     """Read the magnets of a line along which the vehicle drives with its bar over the line."""
     simulated = simulate_drive(one.scene(), np.random.default_rng(one.seed))
-    bar = Vehicle.compact(clearance_m=one.clearance_m).bar
-    readings = [found for found in decode_trace(simulated.trace, bar) if isinstance(found, MagnetReading)]
+    trace = decode_upload(one, simulated)
     inside = {marker.number for marker, at, _left in one.lines if one.from_m <= at < one.to_m}
-    passes, left = [], list(readings)
+    passes, left = [], list(trace.magnets)
     for magnet in simulated.magnets:
         near = [reading for reading in left if _is_near(reading, magnet)]
         nearest = min(near, key=lambda reading: abs(reading.t_s - magnet.t_s)) if near else None
@@ -284,28 +358,41 @@ def drive_line(one: MagnetPass, weight: float) -> tuple[list[MarkerPass], list[W
                     cause=None if right else "sensor noise",
                 )
             )  # fmt: skip
+    low, high = LEAD_M, LEAD_M + one.to_m - one.from_m  # the truth lacks magnets at the ends
     wrong = [
         WrongReading(marker=0, text=f"magnet {reading.polarity} at {reading.lateral_cm:.0f} cm")
         for reading in left
-        if LEAD_M <= reading.odometer_m <= LEAD_M + one.to_m - one.from_m  # the truth lacks those at the ends
+        if low <= reading.odometer_m <= high
     ]
+    driven = [(placed.tag, placed.chainage_m) for placed in simulated.tags] + [
+        (_planned_tag(marker).tag, marker.chainage_m - one.from_m + LEAD_M) for marker in one.nearby
+    ]
+    for found in trace.tags:
+        at_m = found.reading.magnets[0].odometer_m
+        there = any(tag == found.reading.tag and abs(at - at_m) < _TAG_ALONG_M for tag, at in driven)
+        if found.reading.tag is not None and low <= at_m <= high and not there:
+            wrong.append(WrongReading(marker=0, text=found.reading.tag.text))
     return passes, wrong
+
+
+def decode_upload(one: MagnetPass, simulated: SimulatedDrive) -> ReadTrace:
+    """What the server reads in the recording of a drive that is uploaded to it."""
+    declared = DeclaredTrace(unit="uT", axes="ISO8855", bar=BarDeclaration(forward_m=FORWARD_M))
+    with pack(write_tables(simulated.trace)).open() as stream:
+        trace = read_trace({"drive.zip": stream}, declared).trace
+    nearby = NearbyTags.of(one.rows, EPOCH)
+    findings, _version = find_magnets(trace, declared, nearby.texts, () if nearby.texts else one.formats)
+    return nearby.match(findings, declared.sensors)
 
 
 def read_tag(one: MagnetPass) -> tuple[bool, list[float] | None, list[str]]:
     """Whether the tag was read, error of the fix along and across, and codes that are not there."""
     assert one.tag is not None
-    scene = one.scene()
-    rng = np.random.default_rng(one.seed)
-    simulated = simulate_drive(scene, rng)
-    registered = [_registered_tag(marker, one.survey_rmse_m, rng) for marker in one.nearby]
+    simulated = simulate_drive(one.scene(), np.random.default_rng(one.seed))
     tag = _planned_tag(one.tag).tag
-    formats = {TagFormat(tag.magnet_count, tag.length_m, tag.segment_m)}
-    bar = scene.vehicle.bar
-    findings = decode_trace(simulated.trace, bar, candidates=tag_candidates(registered, formats))
     magnets = [magnet for magnet in simulated.magnets if magnet.tag == 0]
     read, fix_m, wrong = False, None, []
-    for found in match_tags(findings, registered, bar).tags:
+    for found in decode_upload(one, simulated).tags:
         near = bool(magnets) and _first_apart_m(found.reading.start_s, magnets[0]) < _TAG_REACH_M
         if found.reading.tag == tag and near and not found.reading.wrong_way:
             read = True
@@ -356,19 +443,6 @@ def _fix_error(
     true_along = _planned_tag(one.tag).tag.length_m + driven_m - forward_m * math.cos(turn)
     true_across = -last.lateral_cm / 100 + forward_m * math.sin(turn)
     return [float(along - true_along), float(across - true_across)]
-
-
-def _registered_tag(marker: PlannedMarker, rmse_m: float, rng: np.random.Generator) -> RegisteredTag:
-    """A tag of the plan as it is registered after a survey."""
-    planned = _planned_tag(marker)
-    off = rng.normal(0, rmse_m / math.sqrt(2), 2)
-    height = marker.height_m or 0.0
-    lon, lat, _height = wgs84_from_enu(np.array([*off, 0.0]), (marker.lon_deg, marker.lat_deg, height))
-    bearing = _bearing_deg(marker) + float(rng.normal(0, _HEADING_STD_DEG))
-    return RegisteredTag(
-        str(marker.number), "surveyed", planned.tag, lon, lat, height, bearing, marker.lon_deg, marker.lat_deg,
-        rmse_m, grade_accuracy(rmse_m), meaning=planned.meaning,
-    )  # fmt: skip
 
 
 def _bearing_deg(marker: PlannedMarker) -> float:

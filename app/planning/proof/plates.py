@@ -1,7 +1,8 @@
 """One pass over a plate of the plan: frames through the simulation and the decoder, the fix, and why it was missed.
 
 The simulated road is flat and straight; bends and changes of grade are put in as what they are for the camera: another
-place and direction of the plate, and another height and pitch of the camera above the plate's plane.
+place and direction of the plate, and another height and pitch of the camera above the plate's plane. A frame is decoded
+as one that a vehicle uploads: by the functions that decode uploads, with the rows of the registered plates nearby.
 """
 
 from __future__ import annotations
@@ -14,18 +15,28 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.pose import fix_vehicle
-from app.decoders.plate.reader import decode_plates
+from app.decoders.plate.pose import VehicleFix
+from app.decoding.declarations import CoarsePosition, DecodeContext
+from app.decoding.frames import (
+    Nearby,
+    fix_from_match,
+    fuse_fixes,
+    match_plate,
+    read_plates,
+    search_plates,
+    with_registered_size,
+)
+from app.formats.images import load_image
 from app.geodesy import enu_from_heading, enu_from_wgs84, wgs84_from_enu
-from app.markers.plate import PlateCode
-from app.markers.reading import PlateOutcome, PlateReading
+from app.markers.reading import MarkerRow
 from app.planning.alignment import Lane
 from app.planning.plan import PlannedMarker, PlannedPlate
+from app.planning.proof.drives import COARSE_M, EPOCH, START
 from app.planning.proof.report import Condition, MarkerPass, WrongReading
 from app.planning.rules import CameraRules
-from app.sensors.camera import Camera
+from app.sensors.camera import Camera, CameraDeclaration
 from app.simulation.backgrounds import road_background, road_photos
-from app.simulation.camera import render_plate_scene
+from app.simulation.camera import RenderedFrame, render_plate_scene
 from app.simulation.conditions import (
     Conditions,
     Drive,
@@ -139,9 +150,8 @@ class PlatePass:
     fps: float
     left_m: float
     rotation_deg: float
-    codebook: Sequence[PlateCode]  # of the plates nearby
-    survey_error_m: Floats  # shape (2,): [m] east and north of the registered from the true position
-    survey_rmse_m: float
+    rows: Sequence[MarkerRow]  # of the plates about the marker, after the survey
+    coarse_error_m: Floats  # shape (2,): [m] east and north of the coarse position from the vehicle's true one
     noise_seed: tuple[int, ...]
     # `bends`, `grades`: whether the lane's curvature and grade are simulated
     bends: bool = True
@@ -152,6 +162,23 @@ class PlatePass:
         """What the marker is."""
         assert isinstance(self.marker.detail, PlannedPlate)
         return self.marker.detail
+
+    def context(self, ahead_m: float) -> DecodeContext:
+        """What the vehicle sends with a frame that it takes at a distance from the plate."""
+        at_m = max(self.marker.chainage_m - ahead_m, 0.0)
+        (lon_deg,), (lat_deg,) = self.lane.position_at(at_m, self.marker.offset_m - self.left_m)
+        lon, lat, _height = wgs84_from_enu(np.array([*self.coarse_error_m, 0.0]), (lon_deg, lat_deg, 0.0))
+        camera = self.camera
+        return DecodeContext(
+            coarse_position=CoarsePosition(lon_deg=lon, lat_deg=lat, accuracy_m=COARSE_M),
+            heading_deg=float(self.lane.heading_at(at_m)),
+            camera=CameraDeclaration(
+                width_px=camera.width_px, height_px=camera.height_px, fx_px=camera.fx_px, fy_px=camera.fy_px,
+                cx_px=camera.cx_px, cy_px=camera.cy_px, height_m=camera.height_m, depression_deg=camera.depression_deg,
+                readout_s=self.conditions.sensor.readout_s,
+            ),
+            captured_at=START,
+        )  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -224,15 +251,13 @@ def read_frames(one: PlatePass, *, enough: int | None = None, most: int | None =
     for nearest in _spread_order(len(scenes)):
         k, scene = scenes[nearest]
         frame = render_plate_scene(scene, background, np.random.default_rng((*one.noise_seed, k)))
-        hit = _read(one, frame.image, frame.truths[0].corners_px, out)
-        out.frames.append((_unit_px(one, scene), hit is not None))
-        if hit is None:
-            continue
-        out.read += 1
-        if hit.pose is not None:
-            error, size = fix_error(one, hit, scene)
+        hit, fix = _read(one, scene, frame, out)
+        out.frames.append((_unit_px(one, scene), hit))
+        out.read += hit
+        if fix is not None:
+            size = float(np.trace(fix.covariance[:2, :2]))
             if size < best:
-                best, out.fix_m = size, error
+                best, out.fix_m = size, fix_error(one, fix, scene)
         if enough is not None and out.read >= enough:
             break
     return out
@@ -250,21 +275,37 @@ def _spread_order(count: int) -> list[int]:
     return sorted(range(count), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))
 
 
-def _read(one: PlatePass, image: Image, corners_px: Floats, out: FramesRead) -> PlateReading | None:
+def _read(
+    one: PlatePass, scene: PlateScene, rendered: RenderedFrame, out: FramesRead
+) -> tuple[bool, VehicleFix | None]:
+    """Decode a frame as the server decodes an upload: whether the plate was read, and the vehicle's position."""
     cv2.setNumThreads(1)
-    readings = decode_plates(image, camera=one.camera, codebook=one.codebook, geometries=(one.plate.geometry,))
-    hit = None
-    for reading in readings:
-        if reading.outcome is not PlateOutcome.READ or reading.code is None:
+    context = one.context(scene.faces[0].ahead_m)
+    position = context.coarse_position
+    assert position is not None
+    frame = load_image(rendered.jpeg)
+    camera = context.camera_of(frame.header)
+    assert camera is not None
+    nearby = Nearby.of(one.rows, position)
+    corners_px = rendered.truths[0].corners_px
+    read, fixes = False, []
+    for reading in read_plates(frame.pixels, search_plates(nearby, camera)):
+        if reading.code is None:
             continue
         assert reading.corners_px is not None
         apart_px = np.linalg.norm(reading.corners_px.mean(axis=0) - corners_px.mean(axis=0))
         is_there = apart_px < np.ptp(corners_px, axis=0).max() / 2
         if reading.code.digits == one.plate.code.digits and is_there:
-            hit = hit or reading
+            read = True
         else:
             out.wrong.append(reading.code.digits)
-    return hit
+        match = match_plate(nearby, reading.code, position)
+        pose = None if match is None else with_registered_size(reading, match, camera).pose
+        if match is not None and pose is not None:
+            fix = fix_from_match(pose, camera, match, "plate", context.heading_deg, epoch=EPOCH)
+            fixes += [fix] if fix is not None else []
+    fused = fuse_fixes(fixes)
+    return read, None if fused is None else fused.vehicle
 
 
 def scenes_of(one: PlatePass, rng: np.random.Generator) -> Iterator[PlateScene]:
@@ -316,21 +357,14 @@ def _on_road(scene: PlateScene, one: PlatePass) -> PlateScene:
     return scene
 
 
-def fix_error(one: PlatePass, reading: PlateReading, scene: PlateScene) -> tuple[list[float], float]:
-    """Error of the vehicle's position from one frame, along and across the plate's direction, and its size. [m]"""
-    assert reading.pose is not None
+def fix_error(one: PlatePass, fix: VehicleFix, scene: PlateScene) -> list[float]:
+    """Error of the vehicle's position from one frame, along and across the plate's direction. [m]"""
     marker = one.marker
     true = (marker.lon_deg, marker.lat_deg, marker.height_m or 0.0)
-    lon, lat, _height = wgs84_from_enu(np.array([*one.survey_error_m, 0.0]), true)
-    accuracy_m = max(one.survey_rmse_m, 1e-3)
-    fix = fix_vehicle(
-        reading.pose, one.camera, lon_deg=lon, lat_deg=lat, height_m=true[2], heading_deg=marker.heading_deg,
-        horizontal_rmse_m=accuracy_m, vertical_rmse_m=accuracy_m, heading_rmse_deg=0.1,
-    )  # fmt: skip
     fixed = enu_from_wgs84(fix.lon_deg, fix.lat_deg, true[2], true)
     placed = scene.faces[0]
     ground_from_vehicle = scene.camera_from_ground.T @ one.camera.camera_from_vehicle
     vehicle = (0.0, 0.0, scene.camera.height_m) - ground_from_vehicle @ one.camera.position_vehicle_m
     in_plate = placed.ground_from_face.T @ (vehicle - (placed.ahead_m, placed.left_m, 0.0))
     off = enu_from_heading(marker.heading_deg).T @ fixed - in_plate  # right, up (along), out of the road
-    return [float(off[1]), float(-off[0])], float(np.trace(fix.covariance[:2, :2]))
+    return [float(off[1]), float(-off[0])]

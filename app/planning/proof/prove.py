@@ -5,31 +5,38 @@ from __future__ import annotations
 import math
 import zlib
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 import scipy
 
+from app.decoders.magnet.identify import TagFormat
+from app.decoding.declarations import CoarsePosition, DeclaredTrace
+from app.decoding.recordings import MAX_MAGNET_ROWS, radio_of
 from app.errors import InvalidParameter
 from app.geodesy.frames import ecef_from_wgs84
-from app.markers.plate import PlateCode
+from app.markers.magnet_design import Codebook
+from app.markers.reading import MarkerRow
 from app.planning.alignment import Lane
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
-from app.planning.plan_checks.families import radio_settings
 from app.planning.plate_view import camera_of
 from app.planning.proof.drives import (
     ASIDE_M,
     AUDIBLE_M,
+    COARSE_M,
     LEAD_M,
+    RADIUS_95,
     TAIL_M,
     LanePass,
     MagnetPass,
+    coarse_position,
     drive_cerpms,
     drive_line,
     drive_tag,
     simulated_radio,
+    surveyed_row,
 )
 from app.planning.proof.plates import PLACEMENT_SD_M, ROTATION_SD_DEG, PlatePass, draw_drive, draw_plate, drive_plate
 from app.planning.proof.report import (
@@ -45,7 +52,6 @@ from app.planning.proof.report import (
     parse_conditions,
     summarize,
 )
-from app.radio.settings import RadioSettings
 from app.simulation.conditions import Conditions
 from app.simulation.radio.link import Radio
 from app.values import Floats
@@ -157,7 +163,8 @@ LINE_STRETCH_M, LANE_STRETCH_M = 60.0, 500.0
 TAGS_NEAR_M = 500.0
 """[m] within which tags are looked for. A road with one codebook."""
 NEAR_M = 200.0
-"""[m] within which plates are in the codebook of a frame. Source: ten times the 20 m of a coarse position."""
+"""[m] about a plate, within which others can be in the codebook of a frame. Source: the 120 m of a coarse position with
+the range of view, the 18 m from where frames are taken, and the error of the position."""
 MAX_UNITS = 10_000
 """Units of one proof at most. Some hours of work on two cores."""
 _MIN_MARKERS = 4  # in a stretch that is driven; two pairs
@@ -167,11 +174,18 @@ _NO_PASS = MarkerPass(marker=0, weight=0.0, lost=True, readable=0, seen=0, read=
 
 
 class Prover:
-    """A plan and terms, with what units share; one a process."""
+    """A plan and terms, with what units share; one a process.
 
-    def __init__(self, plan: Plan, terms: ProofTerms) -> None:
+    Parameters
+    ----------
+    rows : mapping of int to MarkerRow
+        Rows of the plan's markers as its commit stores them, by their numbers in the plan.
+    """
+
+    def __init__(self, plan: Plan, terms: ProofTerms, rows: Mapping[int, MarkerRow]) -> None:
         self.plan = plan
         self.terms = terms
+        self.rows = rows
         self.lanes = {lane.name: lane for lane in plan.alignment.lanes}
         self.by_number = {marker.number: marker for marker in plan.markers}
         self._frames: dict[str, LaneFrame] = {}
@@ -335,6 +349,10 @@ class Prover:
         tags = [
             one for one in self._tags if one.lane == lane and low - TAGS_NEAR_M <= one.chainage_m <= high + TAGS_NEAR_M
         ]
+        start_m = max(low - LEAD_M, 0.0)
+        (lon_deg,), (lat_deg,) = self.lanes[lane].position_at(start_m, left_m)
+        position = coarse_position(float(lon_deg), float(lat_deg), self.rng(drive, "coarse", lane, int(start_m)))
+        book = self.plan.codebook
         return MagnetPass(
             lane=self.lanes[lane],
             from_m=low,
@@ -342,12 +360,38 @@ class Prover:
             tag=tag,
             lines=self._along(lane, PlannedLineMagnet, *reach_m, drive),
             nearby=tags,
+            position=position,
+            rows=self._magnet_rows(position, drive),
+            formats=() if book is None else (_format_of(book),),
             left_m=left_m,
             speed_m_s=self._speed_m_s(lane, (low + high) / 2),
             clearance_m=self.terms.clearance_m,
-            survey_rmse_m=self.terms.survey_rmse_m,
             seed=seed,
         )
+
+    def _magnet_rows(self, position: CoarsePosition, drive: int) -> list[MarkerRow]:
+        """The magnet markers that the server looks for in a recording that begins at a coarse position."""
+        numbers, tree = self._magnets
+        if not numbers:
+            return []
+        reach_m = position.accuracy_m + DeclaredTrace().reach_m
+        near = tree.query_ball_point(ecef_from_wgs84(np.array(position.lon_deg), np.array(position.lat_deg)), reach_m)
+        return [self.surveyed(numbers[k], drive) for k in sorted(near)[:MAX_MAGNET_ROWS]]
+
+    @cached_property
+    def _magnets(self) -> tuple[list[int], scipy.spatial.cKDTree]:
+        return self._row_tree("magnet")
+
+    def _row_tree(self, family: str) -> tuple[list[int], scipy.spatial.cKDTree]:
+        """Numbers of the rows of a family, and their places."""
+        numbers = [number for number, row in self.rows.items() if row.family == family]
+        rows = [self.rows[number] for number in numbers]
+        lon_deg, lat_deg = np.array([row.lon_deg for row in rows]), np.array([row.lat_deg for row in rows])
+        return numbers, scipy.spatial.cKDTree(ecef_from_wgs84(lon_deg, lat_deg).reshape(-1, 3))
+
+    def surveyed(self, number: int, drive: int) -> MarkerRow:
+        """The row of a marker after the commit and a survey; each drive is after another survey."""
+        return surveyed_row(self.rows[number], self.terms.survey_rmse_m, self.rng(drive, "survey", number))
 
     @cached_property
     def _tags(self) -> list[PlannedMarker]:
@@ -361,6 +405,7 @@ class Prover:
             from_m=unit.from_m,
             to_m=unit.to_m,
             markers=self._along(unit.lane, PlannedCerpm, low, high, unit.drive, ASIDE_M),
+            rows=self.rows,
             own=frozenset(one.detail.number for one, _, _ in own if isinstance(one.detail, PlannedCerpm)),
             radio=self._radio,
             speed_m_s=self._speed_m_s(unit.lane, (unit.from_m + unit.to_m) / 2),
@@ -370,8 +415,8 @@ class Prover:
 
     @cached_property
     def _radio(self) -> Radio:
-        """Of the CERPMs, as the checks of the plan have it."""
-        return simulated_radio(self.plan.radio or radio_settings(self.plan) or RadioSettings())
+        """Of the CERPMs, as they are programmed."""
+        return simulated_radio(next(radio_of(row) for row in self.rows.values() if row.family == "cerpm"))
 
     def _speed_m_s(self, lane: str, at_m: float) -> float:
         one = self.lanes[lane]
@@ -408,29 +453,23 @@ class Prover:
             fps=drive.camera.frames_per_s,
             left_m=marker.offset_m + habit_m + float(rng.normal(0, PLACEMENT_SD_M / math.sqrt(2))),
             rotation_deg=float(rng.normal(0, ROTATION_SD_DEG)),
-            codebook=self.plates_near(marker),
-            survey_error_m=rng.normal(0, self.terms.survey_rmse_m / math.sqrt(2), 2),
-            survey_rmse_m=self.terms.survey_rmse_m,
+            rows=self.plates_near(marker, drive.drive),
+            coarse_error_m=rng.normal(0, COARSE_M / RADIUS_95, 2),
             noise_seed=self.seed_of(drive.drive, "noise", marker.number),
         )
 
     def _drive_conditions(self, drive: DriveTerms, parts: frozenset[Condition]) -> Conditions:
         return draw_drive(drive.camera, parts, self.rng(drive.drive, "drive"))
 
-    def plates_near(self, marker: PlannedMarker) -> tuple[PlateCode, ...]:
-        """Codes of the plan's plates that a vehicle would look for at a marker, its own among them."""
-        plates, tree = self._plates
+    def plates_near(self, marker: PlannedMarker, drive: int) -> list[MarkerRow]:
+        """Rows of the plates about a marker, its own among them."""
+        numbers, tree = self._plates
         near = tree.query_ball_point(ecef_from_wgs84(np.array(marker.lon_deg), np.array(marker.lat_deg)), NEAR_M)
-        return tuple(plates[k] for k in sorted(near))
+        return [self.surveyed(numbers[k], drive) for k in sorted(near)]
 
     @cached_property
-    def _plates(self) -> tuple[list[PlateCode], scipy.spatial.cKDTree]:
-        found = [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedPlate)]
-        codes = [marker.detail.code for marker in found if isinstance(marker.detail, PlannedPlate)]
-        places = ecef_from_wgs84(
-            np.array([marker.lon_deg for marker in found]), np.array([marker.lat_deg for marker in found])
-        )
-        return codes, scipy.spatial.cKDTree(places)
+    def _plates(self) -> tuple[list[int], scipy.spatial.cKDTree]:
+        return self._row_tree("plate")
 
 
 def _chunks(kind: UnitKind, drive: int, chosen: Sequence[tuple[PlannedMarker, float]], size: int) -> list[ProofUnit]:
@@ -445,17 +484,11 @@ def _chunks(kind: UnitKind, drive: int, chosen: Sequence[tuple[PlannedMarker, fl
     return units
 
 
-def list_units(plan: Plan, terms: ProofTerms) -> list[ProofUnit]:
-    """All units of a proof, drive by drive; the same for the same plan and terms."""
-    return Prover(plan, terms).list_units()
+def _format_of(book: Codebook) -> TagFormat:
+    return TagFormat(book.design.magnets, book.design.length_m, book.design.segment_m)
 
 
-def prove_unit(plan: Plan, terms: ProofTerms, unit: ProofUnit) -> UnitResult:
-    """Compute one unit; for many units of one plan, `Prover` saves the preparation."""
-    return Prover(plan, terms).prove_unit(unit)
-
-
-def prove_plan(plan: Plan, terms: ProofTerms) -> ProofReport:
-    """Compute all units here, one after the other, and summarize them."""
-    prover = Prover(plan, terms)
+def prove_plan(plan: Plan, terms: ProofTerms, rows: Mapping[int, MarkerRow]) -> ProofReport:
+    """Compute all units here, one after the other, and summarize them; `rows` as of `Prover`."""
+    prover = Prover(plan, terms, rows)
     return summarize(plan, terms, [prover.prove_unit(unit) for unit in prover.list_units()])

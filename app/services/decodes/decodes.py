@@ -10,6 +10,7 @@ from typing_extensions import TypedDict
 
 from app.decoders.cerpm.merge import vehicle_positions
 from app.decoders.cerpm.verify import decode_message
+from app.decoding.declarations import DeclaredPackets, DeclaredTrace, DecodeContext, UploadContext
 from app.errors import InvalidParameter, NotFound, WaymarkError
 from app.formats.format import SpooledFile
 from app.markers.cerpm import MESSAGE_BYTES
@@ -21,7 +22,6 @@ from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
 from app.services.decodes.context import DecodeKind, DecodeRules
-from app.services.decodes.declarations import DeclaredPackets, DeclaredTrace, DecodeContext, UploadContext
 from app.services.decodes.documents import DecodeDocument, DecodeHead, decode_document, decode_head
 from app.services.decodes.frame_poses import track_csv, track_geojson, track_gpx, track_points
 from app.services.decodes.outputs import readings_csv, readings_geojson

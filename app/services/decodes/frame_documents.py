@@ -14,16 +14,17 @@ from typing_extensions import TypedDict
 
 from app import __version__
 from app.decoders.plate import DECODER_VERSION
+from app.decoding.frames import Fix, Match
 from app.errors import WaymarkError
 from app.families import get_family, union_of_documents
-from app.families.family import FrameReading, Match
+from app.families.family import FrameReading
 from app.families.plate.plates import PLATE
 from app.formats.images import ImageHeader
 from app.geodesy import LocalizationGrade
 from app.markers.reading import PlateOutcome
 from app.services.decodes.context import count_of
 from app.services.decodes.frame_poses import FramePose, GapDocument, ReceiverPositions
-from app.services.decodes.matching import FRAME_READERS, Fix
+from app.services.decodes.matching import FRAME_READERS
 from app.services.documents import ErrorDocument, document_of, error_document, rounded
 from app.services.health.record import FrameHealth
 

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from typing_extensions import TypedDict
 
+from app.decoding.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.formats.frame_list import FrameList, ListedFrame
 from app.formats.logs import LogReport, has_zone
 from app.formats.text import TableWriter
@@ -21,7 +22,6 @@ from app.geodesy.frames import metres_per_radian
 from app.registry.decodes import DecodeRow, StoredResult
 from app.sensors.pose_track import PoseTrack
 from app.services.decodes.context import DecodeKind, DecodeTimes, clock_of, stamp
-from app.services.decodes.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.services.documents import listed
 from app.tracks.files import gpx_document
 from app.values import Floats

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from app.decoding.frames import DecodePlates
 from app.errors import ProcessStopped, WaymarkError
 from app.families.family import FrameReader, FrameReading
 from app.families.plate.frames import PlateFrames
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.images import Frame, ImageHeader, ImageLimits, load_image
-from app.markers.reading import PlateReading
 from app.plots.annotated_frame import Outline, draw_outlines, encode_picture
 from app.services.decoder_tasks import decoder_task
 from app.services.decodes.matching import FRAME_READERS
 from app.services.ports import Later
 
-DecodePlates = Callable[..., list[PlateReading]]
 FrameSearch = Mapping[str, object]
 """What to look for in a frame: what each family's `FrameReader.search` returns, by the family's name."""
 _PICTURE = ("picture", "send frames at the camera's resolution, or crop them to the road")

@@ -14,8 +14,11 @@ import sqlalchemy as sa
 
 from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.pose import locate_moving_plate, with_pose
+from app.decoding.declarations import CoarsePosition, DeclaredFrames, DecodeContext
+from app.decoding.frames import Match, fix_from_match, fuse_fixes, with_registered_size
 from app.errors import ProcessStopped, Unavailable, UnsupportedUpload, UploadTooLarge, WaymarkError
-from app.families.family import FrameReading, Match
+from app.families import get_family
+from app.families.family import FrameReading
 from app.families.plate.plates import PLATE
 from app.formats.format import Member, SpooledFile, count_members, is_archive, list_names, read_members
 from app.formats.frame_list import is_beside_frames
@@ -28,18 +31,10 @@ from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.sensors.camera import Camera
 from app.services.decodes.context import DecodeKind, DecodeRules
-from app.services.decodes.declarations import CoarsePosition, DeclaredFrames, DecodeContext
 from app.services.decodes.frame_documents import DriveNotes, ReadFrame, ReadMarker, frames_result
 from app.services.decodes.frame_poses import FramePlaces, FramePose, find_gaps
 from app.services.decodes.frame_tasks import FramePicture, FrameResult, FrameSearch, decode_frame, decode_frames
-from app.services.decodes.matching import (
-    FRAME_READERS,
-    NearbyMarkers,
-    find_nearby_markers,
-    fix_from_match,
-    fuse_fixes,
-    match_reading,
-)
+from app.services.decodes.matching import FRAME_READERS, NearbyMarkers, find_nearby_markers, match_reading
 from app.services.decodes.upload_path import Decoded, PendingSignal, Upload, UploadHandler, cancelled_on_error
 from app.services.decodes.video_tasks import read_frame_lists
 from app.services.health.frames import frame_health, missed_observations, unregistered_readings
@@ -158,11 +153,15 @@ def read_frame(
         speed_m_s = moment.pose.speed_m_s
     markers = []
     for found in result.readings:
-        reading = at_middle_row(found, camera, speed_m_s)
-        match = match_reading(connection, upload.agency_id, reading, context.coarse_position, nearby)
+        match = match_reading(connection, upload.agency_id, found, context.coarse_position, nearby)
+        reading = found
+        if match is not None and isinstance(found, PlateReading):
+            reading = with_registered_size(found, match, camera)
+        reading = at_middle_row(reading, camera, speed_m_s)
         fix = None
         if match is not None and camera is not None and reading.pose is not None:
-            fix = fix_from_match(reading.pose, camera, match, context.heading_deg, epoch=epoch)
+            label = get_family(reading.family).label
+            fix = fix_from_match(reading.pose, camera, match, label, context.heading_deg, epoch=epoch)
         markers.append(ReadMarker(reading, match, fix))
     frame = ReadFrame(
         index=member.index,

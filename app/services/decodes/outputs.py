@@ -9,6 +9,7 @@ from typing import Literal
 
 from typing_extensions import TypedDict
 
+from app.decoding.declarations import DecodeContext
 from app.errors import NotFound
 from app.formats.format import SpooledFile, read_member
 from app.formats.text import TableWriter
@@ -18,7 +19,6 @@ from app.registry.database import Database
 from app.registry.decodes import DecodeRow, StoredResult
 from app.services.access.access import Caller
 from app.services.decodes.context import DecodeKind, DecodeRules, DecodeTimes, clock_of, stamp
-from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.frame_poses import TrackGeometry
 from app.services.decodes.frame_tasks import FramePicture, annotate_frame
 from app.services.decodes.lane_documents import LaneCollection, lane_geojson

@@ -13,6 +13,7 @@ from app import __version__
 from app.decoders.cerpm.merge import Disagreement, vehicle_positions
 from app.decoders.cerpm.signal import SignalProfile
 from app.decoders.cerpm.verify import Verdict, VerifiedPacket
+from app.decoding.recordings import DriveFiles, ReadPackets
 from app.geodesy import LocalizationGrade
 from app.lanes.overlay import LaneInFrame
 from app.lanes.types import Lane
@@ -27,8 +28,7 @@ from app.services.decodes.lane_documents import (
     lane_document,
     steering_document,
 )
-from app.services.decodes.matching import ReadPackets
-from app.services.decodes.packet_tasks import DriveFiles, LaneResult
+from app.services.decodes.packet_tasks import LaneResult
 
 DECODER_VERSION = "cerpm/3"
 MAX_REFUSED = 500

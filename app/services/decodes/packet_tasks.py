@@ -8,25 +8,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from app.errors import InvalidParameter, UnreadableUpload, naming
+from app.decoding.declarations import DeclaredPackets
+from app.decoding.recordings import DriveFiles, estimate_path, read_drive_files
+from app.errors import InvalidParameter
 from app.formats.format import SpooledFile
-from app.formats.images import ImageHeader, ImageLimits, inspect_image, load_image
-from app.formats.kinds import detect_drive_file
-from app.formats.logs import LogReport
-from app.formats.packets.read import read_packets
+from app.formats.images import ImageLimits, load_image
 from app.formats.packets.rows import PacketLimits
-from app.formats.poses import read_poses
 from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.parts import open_parts
 from app.lanes.overlay import LaneInFrame, LaneOverlay, VehiclePose, lane_in_frame, ned_from_enu
 from app.lanes.smooth_line import plane_from_wgs84
-from app.lanes.types import Lane, LaneMarkers, LaneRules, PacketStrengths
+from app.lanes.types import Lane, LaneMarkers, PacketStrengths
 from app.plots.annotated_frame import draw_lane, encode_picture
 from app.plots.lane import SignalPicture, picture_of_lane, plot_lane
 from app.sensors.camera import Camera
-from app.sensors.pose_track import PoseTrack, ReceivedPacket
+from app.sensors.pose_track import PoseTrack
 from app.services.decoder_tasks import decoder_task
-from app.services.decodes.declarations import DeclaredPackets
 
 if TYPE_CHECKING:  # it loads numba
     from app.simulation.steering import SteeringCheck
@@ -34,18 +31,6 @@ if TYPE_CHECKING:  # it loads numba
 _LOG = ("log", "cut the log into shorter ones")
 
 # === Reading.
-
-
-@dataclass(frozen=True, slots=True)
-class DriveFiles:
-    """What the files of a drive hold."""
-
-    packets: list[ReceivedPacket]  # of all packet logs; entries go on counting from file to file
-    track: PoseTrack | None
-    reports: dict[str, LogReport]  # about reading each file
-    frame: tuple[str, ImageHeader] | None  # name and header of the camera frame
-    load_ms: float
-    driven_m: float | None = None  # along the track
 
 
 @decoder_task(*_LOG)
@@ -56,51 +41,8 @@ def read_drive(
     limits: PacketLimits = PacketLimits(),
     images: ImageLimits = ImageLimits(),
 ) -> DriveFiles:
-    """Read the files of a drive: a packet log, or a ZIP of packet logs, poses and a camera frame."""
-    began = time.perf_counter()
-    packets: list[ReceivedPacket] = []
-    track: PoseTrack | None = None
-    frame: tuple[str, ImageHeader] | None = None
-    reports: dict[str, LogReport] = {}
-    with file.open() as stream:
-        for part in open_parts({name: stream}, TraceLimits(file_bytes=limits.file_bytes)):
-            if part.name.startswith("."):
-                continue  # what a desktop leaves in a ZIP
-            data = part.content()
-            kind = (declared.files or {}).get(part.name) or detect_drive_file(part.name, data)
-            if kind == "frame":
-                if frame is not None:
-                    raise _twice("camera frame", part.name)
-                frame = (part.name, inspect_image(data, images))
-            elif kind == "poses":
-                if track is not None:
-                    raise _twice("track", part.name)
-                with naming("packets"):
-                    track, reports[part.name] = read_poses(part.name, data, declared.poses)
-            else:
-                with naming("packets"):
-                    log = read_packets(part.name, data, declared, limits)
-                first = sum(report.entries for read_name, report in reports.items() if read_name != part.name)
-                packets += [replace(packet, entry=packet.entry + first) for packet in log.packets]
-                reports[part.name] = log.report
-    if not packets:
-        raise UnreadableUpload(
-            "there is no packet log in the upload",
-            field="file",
-            limit="one packet log at least",
-            cure="declare which file it is in packets.files if its content does not show it",
-        )
-    driven_m = None if track is None else round(track.driven_m(), 2)
-    return DriveFiles(packets, track, reports, frame, 1e3 * (time.perf_counter() - began), driven_m)
-
-
-def _twice(what: str, name: str) -> UnreadableUpload:
-    return UnreadableUpload(
-        f"{name} is a second {what}",
-        field="file",
-        limit=f"one {what} in an upload",
-        cure="send each drive by itself, or name the kinds of its files in packets.files",
-    )
+    """Read the files of a drive."""
+    return read_drive_files(name, file, declared, limits, images)
 
 
 # === The lane.
@@ -142,11 +84,8 @@ def estimate_lane(
     camera: PosedCamera | None,
 ) -> LaneResult:
     """Estimate a lane through verified markers, simulate a drive along it, and draw it."""
-    from app.lanes.estimate import fit_lane
-
     began = time.perf_counter()
-    rules = LaneRules.of(declared.lane)
-    lane = fit_lane(markers, track, method=declared.method, rules=rules, strengths=strengths)
+    lane = estimate_path(markers, strengths, track, declared)
     steering = _check_steering(lane, declared.steering)
     overlay = _overlay(lane, markers, camera)
     decode_ms = 1e3 * (time.perf_counter() - began)

@@ -10,9 +10,18 @@ from functools import partial
 import numpy as np
 import sqlalchemy as sa
 
-from app.decoders.cerpm.merge import list_numbers, vehicle_positions
+from app.decoders.cerpm.merge import vehicle_positions
 from app.decoders.cerpm.verify import Verdict, Verification
-from app.decoders.magnet.identify import ReadTrace, TagFormat, match_tags
+from app.decoders.magnet.identify import ReadTrace, TagFormat
+from app.decoding.declarations import DeclaredPackets, DeclaredTrace, DecodeContext
+from app.decoding.recordings import (
+    DriveFiles,
+    NearbyTags,
+    ReadPackets,
+    lane_markers,
+    packet_strengths,
+    read_packets_of,
+)
 from app.errors import TooManyRequests, UnreadableUpload
 from app.formats.format import SpooledFile
 from app.geodesy import decimal_year
@@ -24,26 +33,9 @@ from app.registry.decodes import NewObservation
 from app.registry.markers import CODEBOOKS, book_of
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.decodes.context import DecodeKind, DecodeRules
-from app.services.decodes.declarations import DeclaredPackets, DeclaredTrace, DecodeContext
-from app.services.decodes.matching import (
-    NearbyTags,
-    ReadPackets,
-    find_known,
-    find_nearby_tags,
-    lane_markers,
-    packet_strengths,
-    read_packets_of,
-    spans_of,
-)
+from app.services.decodes.matching import find_known, find_nearby_tags, spans_of
 from app.services.decodes.packet_documents import claimed_place, packet_observations, packets_document
-from app.services.decodes.packet_tasks import (
-    DriveFiles,
-    LaneResult,
-    LeftOutMarker,
-    PosedCamera,
-    estimate_lane,
-    read_drive,
-)
+from app.services.decodes.packet_tasks import LaneResult, LeftOutMarker, PosedCamera, estimate_lane, read_drive
 from app.services.decodes.trace_documents import trace_result
 from app.services.decodes.trace_tasks import DecodedTrace, decode_recording
 from app.services.decodes.upload_path import Decoded, OutdatedMatch, PendingSignal, Upload, UploadHandler
@@ -167,7 +159,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
     def match(self, connection: sa.Connection, upload: Upload, signal: TraceSignal) -> Decoded:
         """Match the findings against the registered tags."""
         bar = (upload.context.trace or DeclaredTrace()).sensors
-        trace = match_tags(signal.result.findings, signal.nearby.tags, bar)
+        trace = signal.nearby.match(signal.result.findings, bar)
         document = trace_result(signal.result, trace, codebook_tags=len(signal.nearby.texts))
         nearby, at = signal.nearby, upload.observed_at
         missed = missed_tags(trace, nearby.tags, nearby.complete, bar, at)
@@ -261,8 +253,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
         """Verify the packets against the registry as it is now, and estimate the lane."""
         declared = upload.context.packets or DeclaredPackets()
         with self._database.read() as connection:
-            numbers = list_numbers(files.packets)
-            known = find_known(connection, upload.agency_id, self._secrets, numbers, upload.again_id)
+            known = find_known(connection, upload.agency_id, self._secrets, files.numbers, upload.again_id)
         max_invalid_tags = self._invalid_tags.left(_holder(upload), upload.received_at)
         read = read_packets_of(
             files,

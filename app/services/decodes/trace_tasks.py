@@ -14,6 +14,8 @@ from typing_extensions import TypedDict
 
 from app.decoders.magnet.identify import TagCandidates, TagFormat
 from app.decoders.magnet.readings import Finding
+from app.decoding.declarations import DeclaredTrace
+from app.decoding.recordings import find_magnets
 from app.errors import InvalidParameter
 from app.formats.format import SpooledFile
 from app.formats.traces.declaration import TraceLimits, TraceReport
@@ -23,7 +25,6 @@ from app.markers.magnet import MOMENT_AM2, InformationTag, Orientation, parse_ta
 from app.plots.trace import largest_change, plot_trace
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 from app.services.decoder_tasks import decoder_task
-from app.services.decodes.declarations import DeclaredTrace
 from app.services.documents import listed
 from app.values import Floats
 
@@ -86,7 +87,7 @@ def decode_recording(
         content = read_trace({name: stream}, declared, limits)
     loaded = time.perf_counter()
     trace, report = content.trace, content.report
-    findings, version = _decode(trace, declared, tags, formats)
+    findings, version = find_magnets(trace, declared, tags, formats)
     if declared.method == "matched":
         for mistake in find_mistakes(trace, declared.sensors, findings):
             report.warn(mistake.text)
@@ -95,21 +96,6 @@ def decode_recording(
     report.driven_m = float(np.sum(np.diff(trace.t_s) * (speed[1:] + speed[:-1]) / 2))
     plot = plot_trace(trace, declared.sensors, findings).encode()
     return DecodedTrace(tuple(findings), report, version, plot, _motion(trace))
-
-
-def _decode(
-    trace: MagnetTrace, declared: DeclaredTrace, tags: tuple[str, ...], formats: tuple[TagFormat, ...]
-) -> tuple[list[Finding], str]:
-    """Findings, and the decoder's version."""
-    if declared.method == "metro":
-        from app.decoders.magnet import metro  # not loaded before: scipy.signal takes most of a second
-
-        return metro.decode_trace_metro(trace, declared.sensors), metro.VERSION
-    from app.decoders.magnet.decoder import VERSION, decode_trace
-
-    known = [tag for text in tags if isinstance(tag := parse_tag(text), InformationTag)]
-    candidates = TagCandidates(tags=known) if known else TagCandidates(formats=declared.tag_formats or formats)
-    return decode_trace(trace, declared.sensors, candidates=candidates), VERSION
 
 
 def _motion(trace: MagnetTrace) -> TraceMotion:

@@ -18,6 +18,7 @@ import orjson
 import sqlalchemy as sa
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 
+from app.decoding.declarations import DecodeContext
 from app.errors import Unavailable, WaymarkError
 from app.formats.format import SpooledFile
 from app.registry import audit, jobs, markers
@@ -31,7 +32,6 @@ from app.registry.jobs import JobKind, new_job
 from app.services.access.access import Caller
 from app.services.blobs import StagedBlobs, staged
 from app.services.decodes.context import DecodeKind
-from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.documents import DecodeDocument, decode_document
 from app.services.decodes.frame_documents import FramesResult
 from app.services.decodes.packet_documents import PacketsResult

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sqlalchemy as sa
 
-from app.families.family import FrameReading, Nearby, distance_to_row
+from app.decoding.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
+from app.decoding.frames import Nearby, distance_to_row
+from app.families.family import FrameReading
 from app.formats.format import ArchiveLimits, Member, SpooledFile
 from app.formats.images import ImageHeader, ImageKind
 from app.formats.video_file import (
@@ -23,10 +25,9 @@ from app.formats.video_file import (
     holds_video,
     open_packed_video,
 )
+from app.geodesy.frames import distance_m
 from app.registry.database import Database
-from app.registry.spatial import distance_m
 from app.services.decodes.context import DecodeKind, DecodeRules
-from app.services.decodes.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.services.decodes.frame_documents import (
     DriveNotes,
     ReadFrame,

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from app.decoding.frames import PlateSearch
 from app.errors import InvalidParameter, NotFound
 from app.families.family import FrameReading
-from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.frame_list import is_frame_list, read_frame_list
 from app.formats.poses import PoseDeclaration, PoseLimits, read_poses

@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from app.errors import Conflict, InvalidParameter, NotFound
 from app.inputs import Declaration, Flag, Text
+from app.markers.reading import horizontal_rmse_m
 from app.registry import decodes as decode_store
 from app.registry import jobs as store
 from app.registry.column_types import new_id
@@ -21,7 +22,6 @@ from app.registry.jobs import UNFINISHED, JobKind, JobRow, new_job
 from app.registry.markers import find_markers
 from app.services.access.access import Caller
 from app.services.blobs import delete_unused, staged
-from app.services.decodes.matching import horizontal_rmse_m
 from app.services.drives.collect import Collected, DriveDecode, collect
 from app.services.drives.documents import DrivePage, TrackedDriveDocument, drive_document, drive_head
 from app.services.drives.tasks import write_track

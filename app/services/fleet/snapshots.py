@@ -17,11 +17,11 @@ from app.families import FAMILIES
 from app.families.family import Family
 from app.geodesy import LocalizationGrade, decimal_year, move_to_epoch
 from app.geodesy.place import GRADE_LIMITS_M
+from app.markers.reading import MarkerRow
 from app.markers.snapshot import MAX_MARKERS, MAX_VALIDITY, Trust
 from app.registry import markers
 from app.registry.column_types import row_of
 from app.registry.database import Database
-from app.registry.marker_rows import MarkerRow
 from app.registry.markers import CODEBOOKS, book_of
 from app.registry.spatial import Box
 from app.services.access.access import Caller

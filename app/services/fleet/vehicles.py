@@ -10,19 +10,19 @@ from typing import Annotated, Any
 import sqlalchemy as sa
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
+from app.decoding.declarations import DecodeContext, Profile, UploadContext
 from app.errors import Conflict, InvalidParameter, NotAllowed, NotFound, naming
 from app.formats.format import SpooledFile
 from app.formats.kinds import UploadKind, guess_kind
+from app.geodesy.frames import distance_m
 from app.inputs import Declaration, Identifier, Text, parse_input
 from app.registry import vehicles as store
 from app.registry.database import Database
 from app.registry.resources import first_version
-from app.registry.spatial import distance_m
 from app.registry.vehicles import CALIBRATIONS, VEHICLES, VehicleKeyRow, VehicleRow
 from app.sensors.camera import INTRINSICS, CameraDeclaration
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
-from app.services.decodes.declarations import DecodeContext, Profile, UploadContext
 from app.services.documents import document_of
 from app.services.fleet.documents import (
     VehicleDocument,

@@ -11,21 +11,18 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from app.families.family import Match, Nearby
-from app.families.plate.frames import plate_geometry
+from app.decoding.declarations import DecodeContext
+from app.decoding.frames import Match, Nearby, plate_geometry
 from app.families.plate.plates import PLATE
 from app.families.surveys import RETIRED
 from app.geodesy import decimal_year, enu_from_wgs84
-from app.markers.reading import PlateOutcome, PlatePose
+from app.markers.reading import MarkerRow, PlateOutcome, PlatePose, horizontal_rmse_m, marker_at
 from app.planning.plate_view import unit_heights_px
 from app.planning.predict.rates import DAY, fitted_models, normal_quadrature
 from app.registry.decodes import NewObservation
 from app.registry.health import NewUnregistered
-from app.registry.marker_rows import MarkerRow
 from app.sensors.camera import Camera
-from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.frame_documents import ReadFrame, ReadMarker
-from app.services.decodes.matching import horizontal_rmse_m, marker_at
 from app.services.health.record import EVIDENCE, MISSED, FrameHealth, rounded
 
 SIGMAS_IN_ACCURACY = 3.0

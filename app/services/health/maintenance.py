@@ -20,12 +20,12 @@ from app.formats.text import TableWriter
 from app.health import MarkerState, Verdict
 from app.health.marker_tests import item_priority
 from app.health.states import RULES, TESTED, Fault
+from app.markers.reading import MarkerRow
 from app.registry import audit, health
 from app.registry import health as store
 from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.health import ITEM_FIELDS, HealthRow, ItemFilter, ItemRow, NewUnregistered
-from app.registry.marker_rows import MarkerRow
 from app.registry.markers import get_marker
 from app.registry.webhooks import add_event
 from app.services.access.access import Caller

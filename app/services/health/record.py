@@ -13,6 +13,7 @@ from statistics import median
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
+from app.geodesy.frames import distance_m
 from app.health import (
     Fault,
     JudgedDrive,
@@ -26,7 +27,6 @@ from app.health import (
 from app.registry import health as store
 from app.registry.decodes import NewObservation
 from app.registry.health import HealthRow, NewUnregistered
-from app.registry.spatial import distance_m
 from app.services.health.maintenance import ItemUpload, Suspicion, open_items
 from app.values import JsonObject
 

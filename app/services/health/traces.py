@@ -17,20 +17,18 @@ from app.decoders.cerpm.signal import SignalProfile
 from app.decoders.cerpm.verify import Verdict
 from app.decoders.magnet.identify import ReadTag, ReadTrace, RegisteredTag, TagFix
 from app.decoders.magnet.readings import TagReading
-from app.families.cerpm import radio_of, side_of
+from app.decoding.recordings import DriveFiles, ReadPackets, radio_of, side_of
 from app.geodesy import enu_from_wgs84, wgs84_from_enu
 from app.health.states import LonLat
 from app.markers.cerpm import LaneSide
+from app.markers.reading import MarkerRow, horizontal_rmse_m
 from app.planning.predict.rates import fitted_models
 from app.registry.decodes import NewObservation
-from app.registry.marker_rows import MarkerRow
 from app.registry.markers import list_near
 from app.registry.spatial import distances_m
 from app.sensors.magnetometer_bar import MagnetometerBar
 from app.sensors.pose_track import PoseTrack
-from app.services.decodes.matching import ReadPackets, horizontal_rmse_m
 from app.services.decodes.packet_documents import claimed_place
-from app.services.decodes.packet_tasks import DriveFiles
 from app.services.health.record import EVIDENCE, MISSED, rounded
 
 # === What a packet log shows of the health of CERPMs: those it received, and those that it passed and did not receive.

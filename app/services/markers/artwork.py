@@ -25,12 +25,12 @@ from app.families import FAMILIES, get_family
 from app.families.family import AnyFamily, ArtworkProof
 from app.families.plate.plates import PLATE, is_unfit, plate_order
 from app.inputs import Flag, Number, StrictModel
+from app.markers.reading import MarkerRow
 from app.registry import jobs as registry_jobs
 from app.registry import markers as store
 from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.jobs import JobKind, new_job
-from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Caller
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob

@@ -18,6 +18,7 @@ from app.families import FAMILIES, get_family, union_of_documents
 from app.families.documents import MarkerDocument, MarkerIn, PositionIn, WarningDocument, place_input, position_columns
 from app.families.family import AnyFamily, Registration
 from app.families.surveys import ColumnValues, MarkerRules
+from app.markers.reading import MarkerRow
 from app.registry import decodes as registry_observations
 from app.registry import markers as store
 from app.registry.audit import recording
@@ -25,7 +26,7 @@ from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.decodes import ObservationRow, Place
 from app.registry.history import get_version, list_versions
-from app.registry.marker_rows import MarkerRow, VersionRow
+from app.registry.marker_rows import VersionRow
 from app.registry.markers import get_marker
 from app.registry.resources import check_version
 from app.services.access.access import Caller

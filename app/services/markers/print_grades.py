@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from app.decoding.frames import plate_code, plate_geometry
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
-from app.families.plate.frames import plate_code, plate_geometry
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.images import FIELD, ImageLimits, is_picture, unknown_picture

@@ -9,20 +9,21 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
+from app.decoding.recordings import radio_of
 from app.encoders.cerpm import MarkerProgram, encode_message, explain_payload, write_programs_csv
 from app.encoders.magnet import SheetFormat
 from app.errors import InvalidParameter, NotFound
 from app.families import get_family
-from app.families.cerpm import CERPM, message_of, radio_of
+from app.families.cerpm import CERPM, message_of
 from app.families.family import AnyFamily
 from app.families.surveys import RETIRED
 from app.geodesy import UNFIT_TEXT
 from app.markers.cerpm import MAX_SEQUENCE, derive_marker_key
+from app.markers.reading import MarkerRow
 from app.radio.settings import F_PORT
 from app.registry import markers
 from app.registry import markers as store
 from app.registry.database import Database
-from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Caller, Scope
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.access.audit import log_change

@@ -19,10 +19,10 @@ from app.errors import InvalidParameter, naming
 from app.families import get_family
 from app.families.documents import MarkerDocument
 from app.geodesy import check_lon_lat
+from app.markers.reading import MarkerRow
 from app.registry import markers as store
 from app.registry.database import Database
 from app.registry.history import list_as_of
-from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter
 from app.registry.nearest import find_nearest_at_once, list_nearest, list_places
 from app.registry.spatial import Area, Box, distances_m

@@ -17,6 +17,7 @@ from app.families.family import Family
 from app.families.surveys import PLANNED, Commitment, MarkerRules, PlannedRow
 from app.formats.surveys.declaration import Unit
 from app.markers.magnet_design import Codebook
+from app.markers.reading import MarkerRow
 from app.planning.outputs.plan_document import read_plan
 from app.planning.plan import Plan, PlannedMarker, PlannedTag
 from app.planning.plan_checks import ExistingMarker
@@ -26,7 +27,6 @@ from app.registry.audit import recording
 from app.registry.bulk_load import Columns
 from app.registry.column_types import new_ids, row_of
 from app.registry.database import Database
-from app.registry.marker_rows import MarkerRow
 from app.registry.markers import CODEBOOKS, book_of
 from app.registry.plan_features import replace_planned
 from app.registry.plan_states import find_plan_states, has_status

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import orjson
 
-from app.families import get_family
+from app.families import get_family, rows_of_plan
 from app.formats.alignments.geometry import AlignmentFile
 from app.formats.alignments.read import read_alignment
 from app.formats.format import SpooledFile
@@ -21,7 +21,7 @@ from app.formats.surveys.declaration import Unit
 from app.geodesy.systems import is_ellipsoidal
 from app.markers.magnet_design import Codebook
 from app.markers.plate import PlateGeometry
-from app.markers.reading import PlateReading, worst_verdict
+from app.markers.reading import MarkerRow, PlateReading, worst_verdict
 from app.planning.alignment import Alignment, AlignmentDeclaration, Lane, RoadEvent
 from app.planning.outputs.bill import plan_bill
 from app.planning.outputs.hd_lanelet2 import write_lanelet2
@@ -37,7 +37,6 @@ from app.planning.proof.report import markers_csv
 from app.planning.rules import RoadRules, check_rules
 from app.plots.track import draw_trade_off
 from app.registry.bulk_load import Columns
-from app.registry.marker_rows import MarkerRow
 from app.registry.plan_features import OF_MARKER
 from app.registry.plans import BuiltRow
 from app.services.decoder_tasks import decoder_task
@@ -492,6 +491,8 @@ def write_proof(document: bytes, terms: ProofTerms, results: list[UnitResult]) -
 @lru_cache(maxsize=1)
 def _prover(document: bytes, terms: ProofTerms) -> Prover:
     """A plan with what its units share: one a process, kept until another plan is proved."""
+    from app.planning.proof.drives import START
     from app.planning.proof.prove import Prover
 
-    return Prover(_plan(document), terms)
+    plan = _plan(document)
+    return Prover(plan, terms, rows_of_plan(plan, START))

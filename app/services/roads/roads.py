@@ -11,11 +11,11 @@ import sqlalchemy as sa
 from app.errors import InvalidParameter
 from app.families.documents import MarkerDocument
 from app.geodesy import check_lon_lat
+from app.markers.reading import MarkerRow
 from app.registry import roads as store
 from app.registry.audit import recording
 from app.registry.column_types import row_of
 from app.registry.database import Database
-from app.registry.marker_rows import MarkerRow
 from app.registry.resources import first_version
 from app.registry.roads import ROAD_SUMMARIES, ROADS, RoadRow
 from app.services.access.access import Caller

@@ -17,9 +17,9 @@ from app.formats.format import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.table import Change, Detected, Fault, Severity
 from app.inputs import INPUT, Flag, Text
+from app.markers.reading import MarkerRow
 from app.plots.track import draw_residuals
 from app.registry.conditions import grade_columns
-from app.registry.marker_rows import MarkerRow
 from app.services.documents import cut_text, document_of
 from app.services.markers.plausibility import AccuracyDocument, accuracy_document
 from app.surveys.comparison import Comparison, ComparisonFigures

@@ -24,13 +24,14 @@ from app.families.surveys import (
 )
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.table import Fault
-from app.markers.reading import STATUSES
+from app.geodesy.frames import distance_m
+from app.markers.reading import STATUSES, MarkerRow
 from app.registry import markers
 from app.registry.bulk_load import Columns, JsonTexts, json_objects
 from app.registry.conditions import grade_columns
-from app.registry.marker_rows import CodeRow, MarkerRow
+from app.registry.marker_rows import CodeRow
 from app.registry.markers import PlaceRow
-from app.registry.spatial import Box, distance_m
+from app.registry.spatial import Box
 from app.surveys.comparison import RegisteredPoints
 from app.surveys.georeference import GeoreferencedSurvey
 from app.surveys.location_checks import NEAR_M, Neighbours

@@ -20,12 +20,12 @@ from app.families.family import Registration
 from app.families.surveys import PLANNED, MarkerRules, RowCodes, Rows, SurveyImport
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Faults, Severity
+from app.markers.reading import MarkerRow
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, EntryRow, find_head, recording
 from app.registry.bulk_load import LARGE, Columns
 from app.registry.column_types import new_ids
 from app.registry.database import Database
-from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
 from app.services.documents import kind_of_change, kind_of_new

@@ -16,6 +16,7 @@ from datetime import timedelta
 import sqlalchemy as sa
 import structlog
 
+from app.decoding.declarations import UploadContext
 from app.errors import (
     Conflict,
     Unavailable,
@@ -34,7 +35,6 @@ from app.registry.engines import across_agencies, acting_for
 from app.registry.uploads import PartRow, UploadRow
 from app.services.access.access import Caller, Scope
 from app.services.blobs import delete_unused, staged
-from app.services.decodes.declarations import UploadContext
 from app.services.decodes.decodes import Decodes
 from app.services.decodes.upload_path import UPLOADS
 from app.services.documents import error_document

@@ -190,3 +190,24 @@ def _latest_speed(trace: MagnetTrace) -> Floats:
 def _series(t_s: Floats, name: str, values: Floats) -> bytes:
     lines = [f"{i},{t!r},{v!r}\n" for i, (t, v) in enumerate(zip(t_s.tolist(), values.tolist(), strict=True))]
     return (f",Time Stamp,{name}\n" + "".join(lines)).encode()
+
+
+def write_tables(trace: MagnetTrace) -> dict[str, bytes]:
+    """A trace with its speed and heading as plain CSV, by file name: fields in uT and the axes of ISO 8855.
+
+    Values are rounded to 0.001 uT, a hundredth of what a chip resolves.
+    """
+    names = [f"s{k}_{axis}" for k in range(1, trace.field_ut.shape[1] + 1) for axis in "xyz"]
+    flat = trace.field_ut.reshape(len(trace.t_s), -1)
+    files = {"field.csv": _table(["t_s", *names], np.column_stack([trace.t_s, flat]), "%.6f" + ",%.3f" * len(names))}
+    files["speed.csv"] = _table(["t_s", "speed_m_s"], np.column_stack([trace.speed_t_s, trace.speed_m_s]), "%.6f,%.5f")
+    if trace.heading_t_s is not None and trace.heading_deg is not None:
+        values = np.column_stack([trace.heading_t_s, trace.heading_deg])
+        files["heading.csv"] = _table(["t_s", "heading_deg"], values, "%.6f,%.3f")
+    return files
+
+
+def _table(names: list[str], values: Floats, row: str) -> bytes:
+    """CSV; empty cells for NaN."""
+    text = (row + "\n") * len(values) % tuple(values.ravel().tolist())
+    return (",".join(names) + "\n" + text.replace("nan", "")).encode()

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 import numpy as np
 import numpy.typing as npt
@@ -376,3 +380,31 @@ def marker_message(markers: InstalledMarkers, row: int, sequence: int) -> CerpmM
         speed_limit=markers.speed_limit,
         sequence=sequence,
     )
+
+
+# === What a vehicle uploads of a drive.
+
+
+def write_packets(packets: Sequence[ReceivedPacket]) -> str:
+    """A receiver's log: a JSON object a packet."""
+    lines = [
+        {
+            "time": datetime.fromtimestamp(packet.received_at_s, UTC).isoformat(),
+            "payload_hex": packet.payload.hex() if packet.payload else "",
+            "rssi_dbm": packet.rssi_dbm,
+            "snr_db": packet.snr_db,
+        }
+        for packet in packets
+    ]
+    return "".join(json.dumps(line) + "\n" for line in lines)
+
+
+def write_poses(track: PoseTrack) -> str:
+    """A track as CSV."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(("time_s", "lon_deg", "lat_deg", "heading_deg", "accuracy_m"))
+    for row in zip(track.time_s, track.lon_deg, track.lat_deg, track.heading_deg, track.accuracy_m, strict=True):
+        time_s, lon, lat, heading, accuracy = (float(value) for value in row)
+        writer.writerow((f"{time_s:.3f}", f"{lon:.9f}", f"{lat:.9f}", f"{heading:.3f}", f"{accuracy:.3f}"))
+    return stream.getvalue()

@@ -22,7 +22,7 @@ from app.planning.proof.plates import read_frames
 from app.planning.proof.prove import Prover
 from app.planning.proof.report import DriveTerms
 from app.planning.rules import CameraRules, PlanRules
-from benchmarks.planning.roads import generated_road
+from benchmarks.planning.roads import generated_road, prover_of
 
 FIRST_SEED = 1001
 """Of the roads and drives."""
@@ -77,7 +77,7 @@ class PathSeen(NamedTuple):
 def plate_passes(condition: str, count: int, seed: int) -> Iterator[PlatePassSeen]:
     """Passes by cameras, speeds and exposures that are drawn, over plates of one size."""
     plan = _plan(seed, plates={"spacing_m": 100})
-    prover = Prover(plan, ProofTerms(seed=seed, survey_rmse_m=0.0))
+    prover = prover_of(plan, ProofTerms(seed=seed, survey_rmse_m=0.0))
     rng = np.random.default_rng((seed, 1))
     for k in range(count):
         marker = plan.markers[k % len(plan.markers)]
@@ -112,7 +112,7 @@ def tag_passes(count: int, seed: int) -> Iterator[TagPassSeen]:
         markers = [marker for marker in plan.markers if isinstance(marker.detail, PlannedTag)]
         for k, marker in enumerate(markers):
             clearance = float(rng.uniform(0.08, 0.36))
-            prover = Prover(plan, ProofTerms(seed=seed, clearance_m=clearance, survey_rmse_m=0.0))
+            prover = prover_of(plan, ProofTerms(seed=seed, clearance_m=clearance, survey_rmse_m=0.0))
             speed = float(rng.uniform(*_SPEEDS_KMH)) / 3.6
             one = replace(prover.tag_pass(marker, k), speed_m_s=speed)
             read, fix, _wrong = read_tag(one)
@@ -132,7 +132,7 @@ def line_drives(count: int, seed: int) -> Iterator[LineSeen]:
     rng = np.random.default_rng((seed, 3))
     for k in range(count):
         clearance = float(rng.uniform(0.08, 0.36))
-        prover = Prover(plan, ProofTerms(drives=1, seed=seed + k, clearance_m=clearance, max_sections_per_drive=1))
+        prover = prover_of(plan, ProofTerms(drives=1, seed=seed + k, clearance_m=clearance, max_sections_per_drive=1))
         unit = next(unit for unit in prover.list_units() if unit.kind is UnitKind.LINE)
         speed = float(rng.uniform(*_SPEEDS_KMH)) / 3.6
         passes, _wrong = drive_line(replace(prover.line_pass(unit), speed_m_s=speed), 1.0)
@@ -156,7 +156,7 @@ def path_drives(count: int, seed: int) -> Iterator[PathSeen]:
             seed + k, length_m=length_m, radii_m=radii, rough_m=rough_m, road={"design_speed_kmh": speed_kmh}, **rules
         )
         survey = float(rng.choice([0.0, 0.02, 0.03, 0.06, 0.1]))
-        prover = Prover(plan, ProofTerms(drives=1, seed=seed + k, survey_rmse_m=survey, max_sections_per_drive=2))
+        prover = prover_of(plan, ProofTerms(drives=1, seed=seed + k, survey_rmse_m=survey, max_sections_per_drive=2))
         for unit in prover.list_units():
             seen = path_seen(prover, unit, survey)
             if seen.rms_m > 0:  # the others have no path

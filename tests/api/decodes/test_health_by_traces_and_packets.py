@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 import pytest
 
-from app.demo.cerpms import BuiltLane, build_lane, write_packets, write_poses
+from app.demo.cerpms import BuiltLane, build_lane
 from app.encoders.cerpm import encode_message
 from app.geodesy import wgs84_from_enu
 from app.markers.magnet import InformationTag, parse_tag
@@ -24,7 +24,7 @@ from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road
 from app.simulation.radio.attacks import move_claim
-from app.simulation.radio.drive import Driver, drive_lane, drive_past
+from app.simulation.radio.drive import Driver, drive_lane, drive_past, write_packets, write_poses
 from app.simulation.radio.lanes import InstalledMarkers, lane_between
 from app.simulation.radio.link import Radio
 from tests.api.decodes.conftest import post_frame

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from app.demo.cerpms import BuiltLane, build_lane, draw_frame, path_errors_m, register_lane, write_packets, write_poses
+from app.demo.cerpms import BuiltLane, build_lane, draw_frame, path_errors_m, register_lane
 from app.encoders.cerpm import encode_message
 from app.errors import TooManyRequests
 from app.main import create_app
@@ -32,7 +32,7 @@ from app.services.access.access import Scope
 from app.services.decodes.recordings import InvalidTagLimit
 from app.settings import Settings
 from app.simulation.radio.attacks import forge_packets, move_claim, number_entries, replay_packets
-from app.simulation.radio.drive import SimulatedDrive, drive_past
+from app.simulation.radio.drive import SimulatedDrive, drive_past, write_packets, write_poses
 from app.simulation.radio.lanes import InstalledMarkers
 from app.simulation.radio.link import Radio
 from benchmarks.cerpm.topologies import make_topology

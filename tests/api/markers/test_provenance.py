@@ -12,10 +12,9 @@ import httpx
 import orjson
 import pytest
 
+from app.markers.reading import MarkerRow, horizontal_rmse_m
 from app.registry.column_types import row_of
-from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Scope
-from app.services.decodes.matching import horizontal_rmse_m
 from app.services.markers.plausibility import accuracy_document
 from app.settings import Settings
 from tests.conftest import LiveServer, Place

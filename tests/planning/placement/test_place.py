@@ -156,6 +156,13 @@ def test_cerpms_are_closer_where_a_lane_is_added() -> None:
     assert np.diff(at)[at[1:] < 380] == pytest.approx(24.0, abs=0.6)
 
 
+@pytest.mark.parametrize("length_m", [2, 4, 9])
+def test_lanes_of_a_few_metres_have_a_pair_at_each_end(length_m: int) -> None:
+    made = plan(road(straight(length_m)), cerpm={})
+    assert len(made.markers) == 4
+    assert {round(marker.chainage_m, 3) for marker in made.markers} == {0, length_m}
+
+
 def test_cerpms_of_a_shared_boundary_stand_once_and_name_no_side_where_lanes_differ() -> None:
     lane = straight(300)
     made = plan(road(lane, opposite(lane, "2")), cerpm={})

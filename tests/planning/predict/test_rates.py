@@ -21,8 +21,8 @@ from app.planning.plan_checks.check import check_predictions
 from app.planning.predict.rates import fitted_models, line_rates, path_errors_m, plate_rates, plate_read_rate, tag_rates
 from app.planning.proof import ProofTerms, UnitKind
 from app.planning.proof.drives import drive_cerpms
-from app.planning.proof.prove import Prover
 from app.planning.rules import CameraRules, PlanRules, PredictionRules, check_rules
+from tests.planning.proof.conftest import prover_of
 from tests.planning.roads import bend, road, straight
 
 PLATE = PlateGeometry()
@@ -140,7 +140,7 @@ def test_the_fitted_parameters_name_the_command_that_makes_them() -> None:
 @pytest.mark.slow
 def test_the_path_of_a_proof_is_as_far_off_as_predicted(cerpms: Plan) -> None:
     """Twelve drives of a road on which nothing was fitted; the benchmark has more roads and stricter limits."""
-    prover = Prover(cerpms, ProofTerms(drives=12, seed=5, max_sections_per_drive=10))
+    prover = prover_of(cerpms, ProofTerms(drives=12, seed=5, max_sections_per_drive=10))
     found = [drive_cerpms(prover.lane_pass(u)) for u in prover.list_units() if u.kind is UnitKind.LANE]
     measured = math.sqrt(sum(one["square_sum_m2"] for one in found) / sum(one["covered"] for one in found))
     predicted = [

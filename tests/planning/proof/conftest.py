@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from app.families import rows_of_plan
 from app.formats.alignments.geometry import EventKind
 from app.planning.alignment import Lane, RoadEvent
 from app.planning.placement import place_plan
 from app.planning.plan import Plan
+from app.planning.proof import ProofReport, ProofTerms
+from app.planning.proof.drives import START
+from app.planning.proof.prove import Prover, prove_plan
 from app.planning.rules import PlanRules
 from tests.planning.roads import bend, opposite, road, straight
 
@@ -16,6 +20,16 @@ def plan_on(*lanes: Lane, events: tuple[RoadEvent, ...] = (), **rules: object) -
     """A plan of lanes by rules."""
     checked = PlanRules.model_validate({"version": 1, **rules})
     return place_plan(road(*lanes, events=events), checked, name="proof")
+
+
+def prover_of(plan: Plan, terms: ProofTerms) -> Prover:
+    """The prover of a plan, with the rows that its commit stores."""
+    return Prover(plan, terms, rows_of_plan(plan, START))
+
+
+def prove(plan: Plan, terms: ProofTerms) -> ProofReport:
+    """The whole proof of a plan."""
+    return prove_plan(plan, terms, rows_of_plan(plan, START))
 
 
 @pytest.fixture(scope="session")

@@ -10,15 +10,15 @@ import pytest
 from app.planning.plan import Plan
 from app.planning.proof import ProofTerms
 from app.planning.proof.plates import PlatePass, scenes_of
-from app.planning.proof.prove import Prover
 from app.planning.proof.report import drive_terms
 from app.simulation.plate_scene import PlateScene
+from tests.planning.proof.conftest import prover_of
 from tests.planning.roads import bend, straight
 
 
 @pytest.fixture(scope="module")
 def one(plates: Plan) -> PlatePass:
-    prover = Prover(plates, ProofTerms(drives=1))
+    prover = prover_of(plates, ProofTerms(drives=1))
     made = prover.plate_pass(plates.markers[0], drive_terms(plates, prover.terms, 0))
     return replace(made, left_m=0.0, rotation_deg=0.0)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from app.decoding.declarations import DecodeContext
 from app.errors import UnreadableUpload
 from app.formats.format import SpooledFile
-from app.services.decodes.declarations import DecodeContext
 from app.services.decodes.frame_tasks import FramePicture
 from app.services.decodes.frames import RUN_BYTES, RUN_FRAMES, RUN_PIXELS, ArchiveFrame, FrameMoment, in_runs
 
