@@ -48,6 +48,7 @@ _MIN_PAIRS = 0.8  # that agree
 _UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none
 _ANOTHER_M = 1.3  # [m] centres further apart are of two lanes; half of the narrowest
 _TIE = 14.0  # squared sigmas; odds of 1 to 1,100
+_ENDS, _LONG = 2, 8  # stations at each end of longer courses, where few markers are around the vehicle
 _BOTH_LANES = 3  # stations before and after a line is crossed
 _TRACE_M = 1.1  # [m] of a lane's centre from where it was expected
 _NEARER_COST = 0.05  # [1/m] squared sigmas at each station, so that the next lane comes before the one after it
@@ -75,13 +76,27 @@ class LaneCourse(NamedTuple):
     station_m: Floats  # shape (B,)
     centre_m: Floats  # shape (B,): [m] left of the track
     width_m: Floats  # shape (B,)
-    lane: Ints  # shape (B,): lanes left of the one in which the vehicle is at the end
+    lane: Ints  # shape (B,): lanes left of the last one in which the vehicle is known to be
     doing: Ints  # shape (B,): whether the vehicle keeps its lane, or changes it
 
     @property
     def changing(self) -> Bools:
         """Where the vehicle changes lane, shape (B,)."""
         return np.asarray(self.doing != _KEEPING)
+
+    @property
+    def last(self) -> tuple[float, float]:
+        """From where to where the vehicle keeps the last lane. [m]"""
+        kept = (self.lane == 0) & ~self.changing
+        at = np.flatnonzero(kept[: _last_known(len(kept)) + 1])
+        if not len(at):
+            return float(self.station_m[-1]), float(self.station_m[-1])
+        first, last = int(at[-1]), int(at[-1])
+        while first > 0 and kept[first - 1]:
+            first -= 1
+        while last < len(kept) - 1 and kept[last + 1]:
+            last += 1
+        return float(self.station_m[first]), float(self.station_m[last])
 
     @property
     def vehicle_m(self) -> Floats:
@@ -184,11 +199,18 @@ def describe_tie(chosen: DrivenLane, drive: DrivenLine) -> str:
     )
 
 
+def _last_known(count: int) -> int:
+    """The last station at which enough markers are around the vehicle to show its lane."""
+    return count - 1 - (_ENDS if count > _LONG else 0)
+
+
 def _farthest(course: LaneCourse, other: LaneCourse) -> tuple[int, float]:
-    """The station where two courses, or the lanes at their ends, are farthest apart, and how far. [m]"""
+    """The station where two courses, or their last lanes, are farthest apart, and how far; not at the ends. [m]"""
     apart = np.abs(course.centre_m - other.centre_m)
     apart = np.maximum(apart, np.abs(_last_lane_m(course) - _last_lane_m(other)))
     apart *= ~(course.changing | other.changing)
+    last = _last_known(len(apart))
+    apart[last + 1 :] = apart[: len(apart) - 1 - last] = 0.0
     return int(np.argmax(apart)), float(apart.max())
 
 
@@ -235,7 +257,8 @@ class _Model:
         to_left = (mode[:-1] == _LEFT_BEFORE) & (mode[1:] == _LEFT_AFTER)
         to_right = (mode[:-1] == _RIGHT_BEFORE) & (mode[1:] == _RIGHT_AFTER)
         lane = np.concatenate([[0], np.cumsum(to_left.astype(int) - to_right)])
-        return least, LaneCourse(self.stage_m, self.grid[offset], _WIDTHS_M[width], lane - lane[-1], mode)
+        lane -= lane[_last_known(len(lane))]
+        return least, LaneCourse(self.stage_m, self.grid[offset], _WIDTHS_M[width], lane, mode)
 
     def likely(self, *, with_changes: bool) -> list[tuple[float, LaneCourse]]:
         """The cheapest course, the cheapest of other lanes, and the cheapest one that is elsewhere in one place."""
@@ -471,11 +494,14 @@ def _unexpected_strength(courses: list[LaneCourse], station_m: Floats, left_m: F
 
 def _last_lane_m(course: LaneCourse) -> Floats:
     """Centre of the lane in which the vehicle is at the end, left of the track, shape (B,). [m]"""
-    crossed = np.flatnonzero(np.diff(course.lane))
     centre = course.centre_m.copy()
-    for k in crossed:
+    for k in np.flatnonzero(np.diff(course.lane)):
         to_left = np.sign(course.lane[k + 1] - course.lane[k])
-        centre[: k + 1] += to_left * (course.width_m[k] + course.width_m[k + 1]) / 2
+        apart_m = to_left * (course.width_m[k] + course.width_m[k + 1]) / 2
+        if k < _last_known(len(centre)):
+            centre[: k + 1] += apart_m
+        else:
+            centre[k + 1 :] -= apart_m
     return centre
 
 

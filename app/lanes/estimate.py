@@ -132,9 +132,8 @@ def fit_lane(
         return refused_path(observations, notes, reason, "waymark")
     alone = notes.copy()
     lane = _fit_by_least_squares(observations, taken, line, drive, rules, alone)
-    if lane is None and drive is not None:
-        heard = _passing(strengths, track, observations, taken, drive)
-        lane = _fit_driven_lane(observations, taken, drive, heard, rules, notes)
+    if lane is None and drive is not None and track is not None:
+        lane = _fit_driven_lane(observations, taken, drive, strengths, track, rules, notes)
     if lane is None:
         reason = f"the markers share no line: {len(alone.left_out) - len(notes.left_out)} of them lie off it"
         return refused_path(observations, alone, reason, "waymark")
@@ -267,13 +266,13 @@ def _compared_with_track(lane: Lane, track: PoseTrack, drive: DrivenLine | None)
 
 def _passing(
     strengths: PacketStrengths | None,
-    track: PoseTrack | None,
+    track: PoseTrack,
     observations: LaneObservations,
     taken: Bools,
     drive: DrivenLine,
 ) -> Passing:
     """Packets of markers that the vehicle passed; rows count the taken markers."""
-    if strengths is None or track is None or not len(track.time_s):
+    if strengths is None or not len(track.time_s):
         return NOTHING_PASSED
     number = observations.number[taken]
     order = np.argsort(number)
@@ -296,14 +295,23 @@ def _fit_driven_lane(
     observations: LaneObservations,
     taken: Bools,
     drive: DrivenLine,
-    heard: Passing,
+    strengths: PacketStrengths | None,
+    track: PoseTrack,
     rules: LaneRules,
     notes: Notes,
 ) -> Lane | None:
     """Fit the driven one of several lanes, or refuse it; None where the markers are of no more than one lane."""
     half = rules.usual_width_m / 2
-    station, left = drive.line.project_markers(observations.point_m, observations.side, half)
-    chosen = choose_driven_lane(station[taken], left[taken], observations.side[taken], drive, heard)
+    along, left = drive.line.project_markers(observations.point_m, observations.side, half)
+    beyond = taken & ((along < -_BEYOND_TRACK_M) | (along > drive.line.length_m + _BEYOND_TRACK_M))
+    notes, taken = notes.copy(), taken & ~beyond
+    for k in np.flatnonzero(beyond):
+        row, number = int(observations.row[k]), int(observations.number[k])
+        notes.left_out.append(LeftOut(row, number, LeftOutReason.APART, float("nan")))
+    if not taken.any():
+        return None
+    heard = _passing(strengths, track, observations, taken, drive)
+    chosen = choose_driven_lane(along[taken], left[taken], observations.side[taken], drive, heard)
     if chosen is None or (chosen.side != UNKNOWN).all():
         return None
     if chosen.others:
@@ -314,8 +322,9 @@ def _fit_driven_lane(
     line, stays = drive.line, drive
     if course.lane.any():
         line = _line_beside(drive, chosen.last)
-        since_m = float(course.station_m[np.flatnonzero((course.lane != 0) | course.changing)[-1]])
-        stays = replace(drive, line=line, fix_m=drive.fix_m[drive.line.project(drive.fix_m)[0] > since_m])
+        first_m, last_m = course.last
+        station = drive.line.project(drive.fix_m)[0]
+        stays = replace(drive, line=line, fix_m=drive.fix_m[(station >= first_m) & (station <= last_m)])
         if len(stays.fix_m) < _MIN_FIXES:
             return refused_path(observations, notes, _STILL_CHANGING, "waymark")
     side = np.zeros(len(taken), np.int64)
@@ -394,12 +403,15 @@ def _track_in_lane(lane: Lane, track: PoseTrack) -> PoseTrack:
     """The part of a track on which the vehicle was in the path's lane."""
     if not lane.stretches:
         return track
-    since_m = max((part.to_m for part in lane.stretches if part.lane or part.changing), default=0.0)
+    kept = [part for part in lane.stretches if part.lane == 0 and not part.changing]
+    if not kept:
+        return track
     fixes = plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
-    nearest = np.asarray(scipy.spatial.cKDTree(lane.position_enu_m).query(fixes)[1])
-    first = int(np.flatnonzero(lane.station_m[nearest] <= since_m)[-1:].sum())
+    at = lane.station_m[np.asarray(scipy.spatial.cKDTree(lane.position_enu_m).query(fixes)[1])]
+    inside = np.flatnonzero((at >= kept[-1].from_m) & (at <= kept[-1].to_m))
+    first, last = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, len(at))
     columns = (track.time_s, track.lon_deg, track.lat_deg, track.heading_deg, track.accuracy_m)
-    return PoseTrack(*(column[first:] for column in columns))
+    return PoseTrack(*(column[first:last] for column in columns))
 
 
 def _markers_within(lane: Lane, point_m: Floats, half_width_m: float) -> int:

@@ -158,7 +158,7 @@ def drive_cerpms(one: LanePass) -> LanePath:
     true = true_lane(one.lane, low, high)
     installed, rows = install(one, true, low)
     simulated = drive_past(
-        true, installed, one.rng, sign=_sign, radio=one.radio, driver=Driver(speed_m_s=one.speed_m_s),
+        true, installed, one.rng, sign=_sign, radio=one.radio, driver=Driver(speed_m_s=one.speed_m_s, lead_m=0.0),
         receiver=SatelliteReceiver.rtk(), start_s=START.timestamp(),
     )  # fmt: skip
     declared = DeclaredPackets()

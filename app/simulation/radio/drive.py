@@ -340,7 +340,8 @@ def drive_past(
         mean = mean + radio.antenna_pattern.gain_db(np.degrees(np.arctan2(across_m[:, 1], across_m[:, 0]) - yaw))
     strength = mean + draw_shadows_db(sent.sender, travelled, radio, rng)
     strength = strength + rng.normal(0, radio.fading_sd_db, len(strength))
-    received = np.flatnonzero(receive_transmissions(sent.start_s, strength, radio, rng))
+    channel = sent.channel if radio.channels > 1 else None
+    received = np.flatnonzero(receive_transmissions(sent.start_s, strength, radio, rng, channel))
     snr = np.clip(strength[received] - radio.noise_dbm + rng.normal(0, _SNR_SD_DB, len(received)), *_SNR_LIMITS_DB)
     packets = tuple(
         _packet(entry, markers, sent, int(k), radio, sign, float(strength[k]), float(snr[entry]))
