@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -81,6 +82,7 @@ _WITHIN_MARGIN_M = 0.6  # [m] from a boundary; `LaneDeclaration.off_the_line_m`
 _MIN_ROW = 4  # markers in each row of a double line
 _ROWS_M = 0.08  # [m] between the rows of a double line, at least; four times the survey's 0.02 m
 _ROW_SPREAD = 0.3  # of each row, in their distance; one row with normal errors has 0.38
+_MAX_ROWS_SHIFT = 0.25  # between the middles of both rows, in their length; rows one after the other have 0.5
 _MAX_BESIDE_TRACK_M = 4.0  # [m] such sides are of markers at most a lane's width away
 
 
@@ -132,6 +134,10 @@ def fit_lane(
         return refused_path(observations, notes, reason, "waymark")
     alone = notes.copy()
     lane = _fit_by_least_squares(observations, taken, line, drive, rules, alone)
+    if lane is not None and lane.refusal is None and drive is not None:
+        outer = _of_outer_rows(lane, observations)
+        if outer.any():
+            lane = _fit_own_markers(observations, taken, taken & ~outer, line, drive, rules, notes)
     if lane is None and drive is not None and track is not None:
         lane = _fit_driven_lane(observations, taken, drive, strengths, track, rules, notes)
     if lane is None:
@@ -441,18 +447,26 @@ def _fit_own_markers(
 def _of_outer_rows(lane: Lane, observations: LaneObservations) -> Bools:
     """Markers of the outer row of a double line, which is the boundary of the lane beside."""
     known = observations.of_row >= 0
-    residual = np.full(len(observations.side), np.nan)
-    residual[observations.of_row[known]] = lane.residual_m[known]
+    of_row = observations.of_row[known]
+    residual, side = np.full(len(observations.side), np.nan), np.zeros(len(observations.side), np.int64)
+    residual[of_row], side[of_row] = lane.residual_m[known], lane.side[known]
     outer = np.zeros(len(residual), bool)
     for which, outwards in ((LEFT, 1.0), (RIGHT, -1.0)):
-        rows = np.flatnonzero((observations.side == which) & np.isfinite(residual))
+        rows = np.flatnonzero((side == which) & np.isfinite(residual))
         if len(rows) < 2 * _MIN_ROW:
             continue
         off = outwards * residual[rows]
         first, apart_m, spread_m = _split_in_two(np.sort(off))
-        if apart_m > _ROWS_M and spread_m < _ROW_SPREAD * apart_m:
+        if apart_m > _ROWS_M and spread_m < _ROW_SPREAD * apart_m and _side_by_side(off >= first, rows, observations):
             outer[rows[off >= first]] = True
     return outer
+
+
+def _side_by_side(outer: Bools, rows: Ints, observations: LaneObservations) -> bool:
+    """Whether two rows of markers are beside each other rather than one after the other."""
+    point = observations.point_m[rows]
+    middle = point[outer].mean(0) - point[~outer].mean(0)
+    return bool(math.hypot(*middle) < _MAX_ROWS_SHIFT * math.hypot(*np.ptp(point, axis=0)))
 
 
 def _split_in_two(ranked_m: Floats) -> tuple[float, float, float]:
