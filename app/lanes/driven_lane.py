@@ -193,10 +193,10 @@ def describe_tie(chosen: DrivenLane, drive: DrivenLine) -> str:
     good = f"is accurate to {drive.accuracy_m:.1f} m" if np.isfinite(drive.accuracy_m) else "is of unknown accuracy"
     if drive.jump_m > drive.accuracy_m:
         good = f"jumps by {drive.jump_m:.1f} m"
-    return (
-        f"several lanes are equally likely: their centres are {places} of the vehicle's track, which {good}; send the "
-        "track of a receiver with RTK corrections"
-    )
+    cure = "send the track of a receiver with RTK corrections"
+    if len(centres) == 1:
+        return f"it is equally likely that the vehicle changes lane and that it does not: its track {good}; {cure}"
+    return f"several lanes are equally likely: their centres are {places} of the vehicle's track, which {good}; {cure}"
 
 
 def _last_known(count: int) -> int:

@@ -45,10 +45,10 @@ def test_numbers_and_other_texts_stay(text: str) -> None:
 
 
 def test_all_tables_are_written_by_it() -> None:
-    """The demo's files contain no text of users."""
+    """Simulated drives and the demo's files contain no text of users."""
     writers = {
         str(file.relative_to(APP))
         for file in APP.rglob("*.py")
         if re.search(r"csv\.(Dict)?[wW]riter\(", file.read_text())
     }
-    assert writers == {"formats/text.py", "demo/cerpms.py", "demo/run.py"}
+    assert writers == {"formats/text.py", "simulation/radio/drive.py", "demo/run.py"}
