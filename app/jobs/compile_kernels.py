@@ -16,8 +16,11 @@ from app.decoders.plate.detect_blobs import half_planes, ratio_signal
 from app.decoders.plate.reader import decode_plates
 from app.jobs.decoder_process import warm_frame
 from app.lanes.control import Controller
+from app.lanes.driven_lane import choose_driven_lane
+from app.lanes.initial_line import DrivenLine
 from app.lanes.lane_fit import assign_sides
 from app.lanes.least_squares import factor, inverse_band
+from app.lanes.smooth_line import SmoothLine
 from app.sensors.camera import Camera
 from app.services.decodes.trace_tasks import compile_traces
 from app.simulation.camera import render_plate_scene
@@ -50,11 +53,13 @@ def _render_and_read_plate() -> None:
 
 
 def _read_trace_and_track() -> None:
-    """Decode a trace, simulate one, cancel wheel noise, compute a lane's sides and steering, estimate a track."""
+    """Decode a trace, simulate one, cancel wheel noise, find a lane and its sides, steer, estimate a track."""
     compile_traces()
     simulate_drive(Scene(Road(40.0), Vehicle.compact(), Course()), np.random.default_rng(1))
     inverse_band(factor(np.array([[2.0] * 4, [1.0] * 4])))
     assign_sides(_STATIONS_M, np.resize((1.7, -1.7), 4), np.zeros(4, np.int64), wander=0.1, near_track=False)
+    drive = DrivenLine(SmoothLine(np.column_stack((_STATIONS_M, np.zeros(4)))), np.zeros((0, 2)), 0.02, 0.02, 14.0, 0.0)
+    choose_driven_lane(_STATIONS_M, np.resize((1.7, -1.7), 4), np.zeros(4, np.int64), drive)
     path_m = np.column_stack((np.zeros(100), np.arange(100.0)))
     for controller in Controller:
         check_steering(path_m, 50.0, controller=controller, noise=PoseNoise(), rng=np.random.default_rng(1))
