@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from app.compiled import ieee_kernel
-from app.lanes.initial_line import TRUSTED_TRACK_M, DrivenLine
+from app.lanes.initial_line import TRUSTED_TRACK_M, UNKNOWN_ACCURACY_M, DrivenLine
 from app.lanes.types import LEFT, RIGHT, UNKNOWN
 from app.values import Bools, Floats, Ints
 
@@ -45,7 +45,6 @@ _SLOPE_REACH_M, _PAIR_M = 20.0, (5.0, 20.0)  # [m] from a station, and between m
 _MAX_SLOPE, _SLOPE_STEP, _SLOPE_ACROSS_M = 0.24, 0.01, 2.5  # [m/m, m/m, m] of directions that are compared
 _PAIR_ACROSS_M = 2.4  # [m] between such markers; those of neighbouring lines are farther apart
 _MIN_PAIRS = 0.8  # that agree
-_UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none
 _ANOTHER_M = 1.3  # [m] centres further apart are of two lanes; half of the narrowest
 _TIE = 14.0  # squared sigmas; odds of 1 to 1,100
 _ENDS, _LONG = 2, 8  # stations at each end of longer courses, where few markers are around the vehicle
@@ -59,7 +58,7 @@ _ONCOMING_COST = 30.0  # squared sigmas for a lane whose both boundaries send th
 _ONCOMING_SHARE = 0.7  # of the markers on each boundary that send the other side
 _FORBIDDEN = 1e6  # cost of a state that a course may not have; above every course
 _ON_BOUNDARY_M = 0.9  # [m] of a marker from a boundary of its lane
-_PASSING_M = 25.0  # [m] from the vehicle along and across; farther markers do not show in which lane it is
+PASSING_M = 25.0  # [m] from the vehicle along and across; farther markers do not show in which lane it is
 _MIN_PASSING = 10  # packets of markers that are passed
 _ANTENNA_M = 1.5  # [m] of the vehicle's antenna above the markers
 _EXPONENT, _EXPONENT_SD, _LEVEL_SD_DB = 2.0, 0.5, 1000.0  # of free space, with what roads and antennas change
@@ -85,7 +84,7 @@ class LaneCourse(NamedTuple):
         return np.asarray(self.doing != _KEEPING)
 
     @property
-    def last(self) -> tuple[float, float]:
+    def last_stay_m(self) -> tuple[float, float]:
         """From where to where the vehicle keeps the last lane. [m]"""
         kept = (self.lane == 0) & ~self.changing
         at = np.flatnonzero(kept[: _last_known(len(kept)) + 1])
@@ -140,7 +139,7 @@ class DrivenLane:
     side: Ints  # shape (K,): boundary that each marker is on; UNKNOWN for those of other lanes
     course: LaneCourse
     others: tuple[LaneCourse, ...]  # equally likely lanes; none where the driven one is certain
-    last: LaneCourse  # the lane in which the vehicle is at the end, along the whole track
+    last_lane: LaneCourse  # the lane in which the vehicle is at the end, along the whole track
     beside: tuple[CourseBeside, ...]  # other lanes
 
 
@@ -235,7 +234,7 @@ class _Model:
     def of(cls, stage_m: Floats, station_m: Floats, left_m: Floats, drive: DrivenLine) -> _Model:
         """The model of a drive."""
         grid: Floats = np.arange(-_HALF_GRID_M, _HALF_GRID_M + _GRID_M / 2, _GRID_M)
-        accuracy = max(drive.accuracy_m if np.isfinite(drive.accuracy_m) else _UNKNOWN_ACCURACY_M, drive.jump_m)
+        accuracy = max(drive.accuracy_m if np.isfinite(drive.accuracy_m) else UNKNOWN_ACCURACY_M, drive.jump_m)
         precise = accuracy < TRUSTED_TRACK_M
         length_m = _PRECISE_LENGTH_M if precise else max(_SLOW_TIME_S * drive.speed_m_s, _PRECISE_LENGTH_M)
         share, sigma = _STEP_M / length_m, math.hypot(accuracy, _DRIVER_M)
@@ -475,7 +474,7 @@ def _unexpected_strength(courses: list[LaneCourse], station_m: Floats, left_m: F
     for course in courses:
         at = station_m[passing.row] - passing.along_m
         across = left_m[passing.row] - np.interp(at, course.station_m, course.vehicle_m)
-        near = np.abs(passing.along_m) < _PASSING_M
+        near = np.abs(passing.along_m) < PASSING_M
         if near.sum() < _MIN_PASSING:
             return [0.0] * len(courses)
         row, along, side = passing.row[near], passing.along_m[near], np.sign(across[near])

@@ -14,6 +14,7 @@ from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.lanes.driven_lane import (
     NOTHING_PASSED,
+    PASSING_M,
     CourseBeside,
     LaneCourse,
     Passing,
@@ -31,7 +32,7 @@ from app.lanes.initial_line import (
 from app.lanes.lane_fit import LaneFit
 from app.lanes.lane_path import (
     compare_with_track,
-    largest_departure,
+    find_departure,
     path_from_fit,
     path_from_splines,
     refused_path,
@@ -68,13 +69,10 @@ _NOT_ALONG = (
     "markers of several lanes were received, and the vehicle's track runs along none of them: the vehicle changes "
     "lane, or its receiver is less accurate than it states"
 )
-_MIN_DEPARTURE_M, _DEPARTURE_SHARE = 0.4, 0.5  # [m, 1] of a path from a track's shape; share of its stated accuracy
-_UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none
 _STILL_CHANGING = (
     "the vehicle changes lane until the end of the log, so that nothing shows in which lane it is: send a longer log"
 )
 _MIN_FIXES = 10  # of the track in the lane to which the vehicle changed
-_PASSED_M = 45.0  # [m] from the vehicle; packets of farther markers do not show its lane
 _MAX_GAP_M = 25.0  # [m] without a marker of the driven lane, beside markers of others; two spacings
 _MAX_ACROSS_M = 1.6  # [m] that an accurate track moves across its lane; half of a lane
 _MAX_WITHIN = 2  # markers between the boundaries of a path: of a road that crosses, or spoofed
@@ -254,10 +252,7 @@ def _compared_with_track(lane: Lane, track: PoseTrack, drive: DrivenLine | None)
             return lane
         warnings = (*lane.localization_warnings, _TRACK_APART)
         return replace(lane, track_apart=True, localization_warnings=warnings)
-    departure = largest_departure(lane, track)
-    stated = track.accuracy_m[np.isfinite(track.accuracy_m)]
-    accuracy_m = float(np.median(stated)) if len(stated) else _UNKNOWN_ACCURACY_M
-    if departure is not None and departure.rms_m > max(_MIN_DEPARTURE_M, _DEPARTURE_SHARE * accuracy_m):
+    if (departure := find_departure(lane, track)) is not None:
         warning = (
             f"{departure.station_m:.0f} m along it the path turns aside where the vehicle does not, by "
             f"{departure.rms_m:.1f} m: check the datum and the survey of the markers there"
@@ -289,7 +284,7 @@ def _passing(
     fixes = plane_from_wgs84(track.lon_deg, track.lat_deg, observations.origin)
     here = np.stack([np.interp(time_s, track.time_s, fixes[:, axis]) for axis in range(2)], 1)
     point = observations.point_m[taken][row]
-    near = np.hypot(*(here - point).T) < _PASSED_M
+    near = np.hypot(*(here - point).T) < 2 * PASSING_M
     if not near.any():
         return NOTHING_PASSED
     vehicle, _ = drive.line.project(here[near])
@@ -327,8 +322,8 @@ def _fit_driven_lane(
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
     line, stays = drive.line, drive
     if course.lane.any():
-        line = _line_beside(drive, chosen.last)
-        first_m, last_m = course.last
+        line = _line_beside(drive, chosen.last_lane)
+        first_m, last_m = course.last_stay_m
         station = drive.line.project(drive.fix_m)[0]
         stays = replace(drive, line=line, fix_m=drive.fix_m[(station >= first_m) & (station <= last_m)])
         if len(stays.fix_m) < _MIN_FIXES:

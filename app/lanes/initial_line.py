@@ -161,6 +161,7 @@ _NEAR_MARKERS_M = (
 _FINE_TRACK_M = 0.25  # [m] below this noise, one fix a metre is enough; sensitivity 1.00, 1.00
 _SLOW_TO_WHITE = 0.1  # minimum noise over reported accuracy; sensitivity 1.00, 1.00
 _MAX_ACCURACY_M = 10.0  # [m] larger reported accuracies count as this
+UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; a receiver without corrections
 TRUSTED_TRACK_M = 0.5  # [m] reported accuracy below which a track shows the side of a single row; a third of
 # the 1.65 m from the centre to a boundary
 _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745

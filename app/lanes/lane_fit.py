@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from app.compiled import ieee_kernel
-from app.lanes.initial_line import TRUSTED_TRACK_M, DrivenLine
+from app.lanes.initial_line import TRUSTED_TRACK_M, UNKNOWN_ACCURACY_M, DrivenLine
 from app.lanes.least_squares import (
     BENDS,
     OFFSET_MODELS,
@@ -217,7 +217,6 @@ _MIN_SIDED_MARKERS = 4  # to compare sides with the track
 _SIDE_OFFSETS_M = (0.5, 4.0)  # [m] nearest and farthest offset at which a side is clear
 _PRECISE_TRACK_M = 0.06  # [m] noise of an RTK track; source: three times `initial_line._MIN_SIGMA_M`
 _PRECISE_WANDER, _COARSE_WANDER = 0.06, 0.2  # [m/sqrt(m)] of the centre; sensitivity 1.00, 1.00
-_UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; a receiver without corrections
 _SINGLE_SIDE_DRIFTS = (0.05, 0.15, 0.4)  # [m/sqrt(m)] source: the receivers of `least_squares.OFFSET_MODELS`
 _FIX_SIGMAS, _MIN_FIX_REACH_M = (
     8.0,
@@ -500,7 +499,7 @@ def _offset_models(side: Ints, drive: DrivenLine | None) -> tuple[OffsetModel, .
         return ()
     single_side = (side == LEFT).all() or (side == RIGHT).all()
     if single_side and not drive.accuracy_m < TRUSTED_TRACK_M:  # a common offset of the track would not show
-        slow = drive.accuracy_m if np.isfinite(drive.accuracy_m) else _UNKNOWN_ACCURACY_M
+        slow = drive.accuracy_m if np.isfinite(drive.accuracy_m) else UNKNOWN_ACCURACY_M
         return tuple({"drift": value, "slow_m": slow} for value in _SINGLE_SIDE_DRIFTS)
     return OFFSET_MODELS
 

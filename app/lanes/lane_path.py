@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from app.lanes.initial_line import UNKNOWN_ACCURACY_M
 from app.lanes.lane_fit import LaneFit
 from app.lanes.observations import LaneObservations
 from app.lanes.smooth_line import (
@@ -247,7 +248,6 @@ _OFFSET_SD_M = 0.25  # [m] of a driver's usual offset; the upper bound of `bench
 _WANDER_SD_M, _WANDER_LENGTH_M = 0.25, 30.0  # [m, m] source: as above, and `least_squares.OFFSET_MODELS`
 _CUT_M2 = 2.0  # [m2] offset towards the inside of bends, per curvature; source: twice `Driver.cut_m2` of radio drives
 _SHIFT_SD_M, _TURN_SD, _SCALE_SD = 300.0, 0.2, 0.1  # [m, rad, 1] above any mistake that is searched
-_UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none; source: `lane_fit._UNKNOWN_ACCURACY_M`
 _OPTIMISM = 1.5  # true error of a receiver over the accuracy that it reports
 _SLOW_SHARE = 0.3  # of a receiver's error that changes along the track like wander
 _ROUNDS = 12  # of finding the nearest places on the path; converged to a millimetre
@@ -289,8 +289,7 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
     fixes, spacing_m = _thinned(
         plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
     )
-    stated = track.accuracy_m[np.isfinite(track.accuracy_m)]
-    accuracy = _OPTIMISM * max(float(np.median(stated)), 0.0) if len(stated) else _UNKNOWN_ACCURACY_M
+    accuracy = _accuracy_m(track, _OPTIMISM)
     wander = math.hypot(_WANDER_SD_M, _SLOW_SHARE * accuracy) * math.sqrt(max(2 * _WANDER_LENGTH_M / spacing_m, 1.0))
     tree = scipy.spatial.cKDTree(lane.position_enu_m)
     fixes = fixes[np.asarray(tree.query(fixes)[0]) < _MAX_BESIDE_M]
@@ -326,6 +325,12 @@ def runs_apart(lane: Lane, track: PoseTrack) -> bool:
     nearest_m = float(np.min(scipy.spatial.cKDTree(lane.position_enu_m).query(fixes)[0]))
     moved_m = math.hypot(*np.ptp(fixes, axis=0))
     return nearest_m > _APART_M or min(moved_m, float(lane.station_m[-1])) > _MIN_LENGTH_M
+
+
+def _accuracy_m(track: PoseTrack, optimism: float = 1.0) -> float:
+    """Accuracy of a track's receiver: what it states times a factor, or that of one without corrections. [m]"""
+    stated = track.accuracy_m[np.isfinite(track.accuracy_m)]
+    return optimism * max(float(np.median(stated)), 0.0) if len(stated) else UNKNOWN_ACCURACY_M
 
 
 def _thinned(fixes_m: Floats) -> tuple[Floats, float]:
@@ -425,6 +430,7 @@ def _joint_significance(values: Floats, covariance: Floats) -> float:
 
 _WINDOW_M = 36.0  # [m] three spacings of the paper
 _MIN_IN_WINDOW = 8  # steps of the track
+_MIN_DEPARTURE_M, _DEPARTURE_SHARE = 0.4, 0.5  # [m, 1] that is reported; share of the receiver's accuracy
 _SLOW_ERROR_M = 10.0  # [m] of a receiver, on each axis; it is the same within a window
 
 
@@ -435,8 +441,8 @@ class Departure(NamedTuple):
     rms_m: float  # [m] within a window, across the path
 
 
-def largest_departure(lane: Lane, track: PoseTrack) -> Departure | None:
-    """How far a path departs from the shape of the vehicle's track; None where too little of it is beside the path."""
+def find_departure(lane: Lane, track: PoseTrack) -> Departure | None:
+    """Where a path departs from the shape of the vehicle's track; None if it does not, or too little is beside it."""
     if not len(lane.station_m) or np.isnan(lane.curvature_per_m).any() or (np.abs(track.lat_deg) > 90).any():
         return None
     fixes, spacing_m = _thinned(
@@ -463,4 +469,6 @@ def largest_departure(lane: Lane, track: PoseTrack) -> Departure | None:
     explained = np.einsum("wi,wi->w", mixed, np.linalg.solve(squares, mixed[:, :, None])[:, :, 0])
     rms = np.sqrt(np.maximum(windows(off**2) - explained, 0.0) / width)
     worst = int(np.argmax(rms))
+    if rms[worst] < max(_MIN_DEPARTURE_M, _DEPARTURE_SHARE * _accuracy_m(track)):
+        return None
     return Departure(float(lane.station_m[at[worst + width // 2]]), float(rms[worst]))

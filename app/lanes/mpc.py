@@ -137,7 +137,7 @@ def reference_drive(path: FollowedPath, wheelbase_m: float) -> Reference:
 
 
 @ieee_kernel
-def _reference_yaw(headings, step, wheelbase, first):  # type: ignore[no-untyped-def]
+def _reference_yaw(headings: Floats, step: float, wheelbase: float, first: float) -> Floats:
     """Heading of the reference drive by the midpoint rule. [rad]"""
     yaw = np.empty_like(headings)
     yaw[0] = first
@@ -148,9 +148,19 @@ def _reference_yaw(headings, step, wheelbase, first):  # type: ignore[no-untyped
 
 
 @ieee_kernel
-def _write_program(  # type: ignore[no-untyped-def]
-    reference, model, x, y, yaw, speed, wheel, pending, step_s, gain, near
-):
+def _write_program(
+    reference: Reference,
+    model: Model,
+    x: float,
+    y: float,
+    yaw: float,
+    speed: float,
+    wheel: float,
+    pending: Floats,
+    step_s: float,
+    gain: float,
+    near: int,
+) -> tuple[Floats, Floats, Floats, Floats, Floats, float, float, int]:
     """The program at the pose where the next command takes effect.
 
     Also returns the cross-track error there [m], the command of equation 4 [rad], and the nearest piece of the path.
@@ -207,7 +217,16 @@ def _write_program(  # type: ignore[no-untyped-def]
 
 
 @ieee_kernel
-def _model_step(left, turned, wheel, command, middle, speed, front_speed, model):  # type: ignore[no-untyped-def]
+def _model_step(
+    left: float,
+    turned: float,
+    wheel: float,
+    command: float,
+    middle: float,
+    speed: float,
+    front_speed: float,
+    model: Model,
+) -> tuple[float, float, float]:
     """The linear model one step of the horizon later.
 
     Parameters
@@ -229,9 +248,9 @@ def _model_step(left, turned, wheel, command, middle, speed, front_speed, model)
 
 
 @ieee_kernel
-def _between(values, at):  # type: ignore[no-untyped-def]
+def _between(values: Floats, at: float) -> float:
     """Value between two grid points; of the ends beyond them."""
     last = values.shape[0] - 1
     low = min(max(int(at), 0), last - 1)
     share = min(max(at - low, 0.0), 1.0)
-    return values[low] * (1 - share) + values[low + 1] * share
+    return float(values[low] * (1 - share) + values[low + 1] * share)
