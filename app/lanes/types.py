@@ -135,6 +135,11 @@ class LeftOutReason(StrEnum):
     OTHER_LANE = "other_lane"
     """It is another lane's marker: it is on no boundary of the driven lane."""
 
+    @property
+    def text(self) -> str:
+        """For people."""
+        return self.value.replace("_", " ")
+
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:

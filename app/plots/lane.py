@@ -152,7 +152,7 @@ def picture_of_lane(lane: Lane, markers: LaneMarkers, track: PoseTrack | None = 
         marker_m,
         markers.number,
         np.where(elsewhere, -1, np.where(lane.side > 0, lane.side, markers.side)),
-        {out.row: out.reason.value.replace("_", " ") for out in lane.left_out if not elsewhere[out.row]},
+        {out.row: out.reason.text for out in lane.left_out if not elsewhere[out.row]},
         np.empty((0, 2)) if track is None else plane_from_wgs84(track.lon_deg, track.lat_deg, origin),
         lane.refusal,
     )

@@ -13,6 +13,7 @@ from app.decoding.declarations import DecodeContext
 from app.errors import NotFound
 from app.formats.format import SpooledFile, read_member
 from app.formats.text import TableWriter
+from app.lanes.types import LeftOutReason
 from app.plots.annotated_frame import Outline
 from app.registry import decodes as store
 from app.registry.database import Database
@@ -161,7 +162,7 @@ def _cerpm(marker: StoredResult) -> ReadingRow:
         "time_s": None,
         "frame": None,
         "family": "cerpm",
-        "outcome": "left-out" if marker.get("left_out") else "received",
+        "outcome": "received" if marker.get("left_out") in (None, LeftOutReason.OTHER_LANE.text) else "left-out",
         "code": str(marker["number"]),
         "confidence": None,
         "reason": marker.get("left_out") or "; ".join(marker.get("notes", ())) or None,

@@ -302,7 +302,7 @@ def _markers(read: ReadPackets, lane: Lane) -> list[ReceivedMarkerDocument]:
         out = merged.left_out.get(number)
         if out is None and number in off_line:
             entry = off_line[number]
-            out = str(entry.reason).replace("_", " ") + (f", {entry.off_m:.2f} m" if math.isfinite(entry.off_m) else "")
+            out = entry.reason.text + (f", {entry.off_m:.2f} m" if math.isfinite(entry.off_m) else "")
         residual = float(lane.residual_m[k]) if k is not None else math.nan
         side = LaneSide(int(lane.side[k]) or int(merged.side[k])) if k is not None else LaneSide.UNKNOWN
         lon_deg, lat_deg = _place(number, read, k)

@@ -114,6 +114,8 @@ def test_a_road_of_two_lanes_gives_the_driven_one(server: LiveServer) -> None:
         assert path_rms_m(built, found) < 0.03
         assert found["lane"]["localization_grade"] == "cm", found["lane"]["localization_warnings"]
         assert all(marker["registered"] and marker["authentic"] for marker in found["markers"])
+        rows = client.get(f"/v1/decodes/{found['id']}/readings.geojson").json()["features"]
+        assert {row["properties"]["outcome"] for row in rows} == {"received"}  # to be of another lane is no fault
         seen = client.get(f"/v1/markers/{built.markers[-1]['id']}/observations").json()
         assert [one["what"] for one in seen["items"]] == ["seen"]
         (other,) = found["lane"]["other_lanes"]
