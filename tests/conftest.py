@@ -110,7 +110,7 @@ class LiveServer:
     def client(self, key: str | None = ADMIN_KEY) -> httpx.Client:
         """A client that sends a key."""
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        return httpx.Client(base_url=self.url, headers=headers, timeout=280, trust_env=False)
+        return httpx.Client(base_url=self.url, headers=headers, timeout=WITHIN_S, trust_env=False)
 
     def agency(self, name: str, scope: Scope = Scope.PLANNER) -> httpx.Client:
         """A client of an agency, which is created if need be."""

@@ -18,7 +18,7 @@ PERMISSIONS = {
     **{f"GET {folder}": PUBLIC for folder in ("/static", "/guide")},
 }
 """Who may use which route of an app."""
-WITHIN_S = 240.0
+WITHIN_S = 900.0
 """How long `wait_until` waits: far more than a loaded machine needs, less than the time limit of a test. [s]"""
 
 

@@ -17,7 +17,7 @@ from tests.api.plans.test_plans import RULES, road, send_road
 from tests.formats.test_video import HEIGHT, WIDTH, video
 from tests.http import created, finished, wait_until
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 FRAMES = 1200
 """Of the video: enough for several seconds of decoding on a fast machine."""
 MOMENTS = ("sent", "written", "acknowledged")

@@ -26,8 +26,6 @@ from tests.machine import refuse
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.slow,
-    pytest.mark.timeout(600),
     # Celery warns of its default whenever a connection is lost; as an error it would end the worker
     pytest.mark.filterwarnings("ignore::celery.exceptions.CPendingDeprecationWarning"),
 ]

@@ -1,4 +1,4 @@
-"""The image's files, built as docker/Dockerfile does, serve and work as its user and decode every kind of upload."""
+"""The wheel, and the image built as docker/Dockerfile does: it serves as its user and decodes every kind of upload."""
 
 from __future__ import annotations
 
@@ -244,6 +244,25 @@ def decode_all(client: httpx.Client, folder: Path, **headers: str) -> dict[str, 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)  # a loaded machine compiles the decoders for minutes
+def test_the_wheel_has_one_package_at_the_top_with_all_its_files(image: Path, tmp_path: Path) -> None:
+    (wheel,) = (image.parent / "wheel/opt/build/wheels").glob("*.whl")
+    assert wheel.name.startswith(f"waymark_roads-{__version__}-")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    assert {name.split("/")[0] for name in names} == {"app", f"waymark_roads-{__version__}.dist-info"}
+    assert {"app/py.typed", "app/migrations/env.py", "app/static/index.html"} <= set(names)
+    assert {str(path) for path in context_files() if path.parts[0] == "app"} <= set(names)
+    for folder in ("static", "migrations"):
+        assert {f"app/{path}" for path in context_files() if path.parts[0] == folder} <= set(names)
+    asked = "import app, app.registry.database as d; print(app.__file__, d.MIGRATIONS)"
+    python = [str(image / "opt/waymark/bin/python"), "-c", asked]
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("WAYMARK_", "PYTHON"))}
+    found = subprocess.run(python, cwd=tmp_path, env=kept, capture_output=True, text=True, check=True).stdout
+    assert [Path(path).is_relative_to(image) for path in found.split()] == [True, True], found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)  # a loaded machine compiles the decoders for minutes
 def test_the_server_of_the_image_decodes_every_kind_of_upload(image: Path, tmp_path: Path) -> None:
     pip = [str(image / "opt/waymark/bin/python"), "-m", "pip", "show", "waymark-roads"]
     assert f"Version: {__version__}" in subprocess.run(pip, capture_output=True, text=True, check=True).stdout
@@ -258,7 +277,7 @@ def test_the_server_of_the_image_decodes_every_kind_of_upload(image: Path, tmp_p
             page = client.get("/").text
             assert "<title>Waymark</title>" in page
             for name in re.findall(r'(?:src|href)="(/static/[^"]+)"', page):
-                assert client.get(name).status_code == 200
+                assert client.get(name).content == (ROOT / name.removeprefix("/")).read_bytes()
             assert_all_found(decode_all(client, tmp_path))
             ready = client.get("/readyz")
             assert ready.status_code == 200, ready.text

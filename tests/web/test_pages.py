@@ -43,10 +43,11 @@ def wait_until_quiet(watched: Watched) -> None:
     )
 
 
-def audit(watched: Watched) -> list[str]:
-    """What axe-core finds. It is put in by the driver, outside of the page's policy."""
-    run = "axe.run(document, {resultTypes: ['violations']})"
-    watched.page.evaluate(f"() => {{ {AXE} }}")
+def audit(watched: Watched, *rules: str) -> list[str]:
+    """What axe-core finds by all of its rules, or by some. It is put in by the driver, outside of the page's policy."""
+    options = {"resultTypes": ["violations"]} | ({"runOnly": rules} if rules else {})
+    watched.page.evaluate(f"() => {{ if (!window.axe) {{ {AXE} }} }}")
+    run = f"axe.run(document, {json.dumps(options)})"
     found: list[dict[str, Any]] = watched.page.evaluate(run)["violations"]
     return [f"{fault['id']}: {fault['help']}: {node['html'][:200]}" for fault in found for node in fault["nodes"]]
 
@@ -63,10 +64,10 @@ def test_axe_finds_nothing_on_any_page(
     found, too_wide = {}, []
     for path in pages:
         watched.open(path.format(**ids))
-        for scheme in ("light", "dark"):
+        for scheme, rules in (("light", ()), ("dark", ("color-contrast",))):  # only colours differ
             watched.page.emulate_media(color_scheme=scheme)
             wait_until_quiet(watched)
-            if faults := audit(watched):
+            if faults := audit(watched, *rules):
                 found[f"{path}, {scheme}"] = faults
         if phone:
             watched.page.set_viewport_size({"width": 320, "height": 640})
@@ -154,7 +155,6 @@ def test_a_viewer_is_offered_what_a_viewer_may(new_page: OpenPage, server: LiveS
     expect(page.get_by_role("link", name="API keys")).to_have_count(0)
 
 
-@pytest.mark.timeout(600)  # fifty pages
 def test_what_a_vehicle_may_not_see_is_refused_and_said(
     new_page: OpenPage, server: LiveServer, ids: dict[str, str]
 ) -> None:

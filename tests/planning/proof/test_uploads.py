@@ -73,7 +73,7 @@ def test_a_path_is_estimated_from_the_uploaded_files_and_the_registered_rows(
     assert files["declared"] == packets["declared"] == path["declared"] == DeclaredPackets()
     assert packets.keys() - {"result"} == {"files", "known", "declared", "received_at", "observed_at"}
     assert packets["files"] is files["result"]
-    assert path.keys() - {"result"} == {"markers", "track", "declared"}
+    assert path.keys() - {"result"} == {"markers", "track", "declared", "strengths"}
     assert path["track"] is fit["track"] is files["result"].track
     assert (fit["method"], fit["rules"]) == ("waymark", recordings.LaneRules())
     rows = {int(one["result"].digits): one["result"] for one in surveyed}
