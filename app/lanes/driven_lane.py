@@ -41,14 +41,16 @@ _WIDTH_COST = 2.0  # of a width that changes by a step of 0.2 m
 _CHANGE_COST, _CHANGING_COST = 8.0, 2.0  # squared sigmas for a change of lane, and for each station while it lasts
 _CROSSING_M = 0.8  # [m] of a vehicle from the line that it crosses, at the nearest station
 _MAX_CHANGE_MOVE_COST = 12.0  # squared sigmas, of lines that leave their direction while the vehicle changes lane
-_SLOPE_REACH_M, _PAIR_M = 20.0, (5.0, 20.0)  # [m] from a station, and between markers whose direction is a line's
+_SLOPE_REACH_M, _PAIR_M, _WIDE_PAIR_M = 20.0, (5.0, 20.0), (5.0, 32.0)  # [m] from a station, and between two markers
+_MAX_UNKNOWN, _MAX_GAP = 0.5, 6  # share of unknown directions, and stations, through which a direction is interpolated
 _MAX_SLOPE, _SLOPE_STEP, _SLOPE_ACROSS_M = 0.24, 0.01, 2.5  # [m/m, m/m, m] of directions that are compared
 _PAIR_ACROSS_M = 2.4  # [m] between such markers; those of neighbouring lines are farther apart
-_MIN_PAIRS = 0.8  # that agree
+_MIN_PAIRS, _MIN_STEEP_PAIRS, _STEEP = 0.8, 1.5, 0.04  # that agree; of lines that the vehicle crosses [m/m], more
 _ANOTHER_M = 1.3  # [m] centres further apart are of two lanes; half of the narrowest
 _TIE = 14.0  # squared sigmas; odds of 1 to 1,100
 _ENDS, _LONG = 2, 8  # stations at each end of longer courses, where few markers are around the vehicle
-_BOTH_LANES = 3  # stations before and after a line is crossed
+_BOTH_LANES, _BOTH_SHARE = 3, 0.5  # stations before and after a line is crossed, and their share with both lanes
+_CROSSED_M = 60.0  # [m] between the end of a lane on one side and the start of one on the other
 _TRACE_M = 1.1  # [m] of a lane's centre from where it was expected
 _NEARER_COST = 0.05  # [1/m] squared sigmas at each station, so that the next lane comes before the one after it
 _MIN_STRETCH, _MAX_BESIDE = 5, 2  # stations of a lane that is named, and such lanes on each side
@@ -176,12 +178,15 @@ def choose_driven_lane(
         return None
     (least, _, course), *rivals = lanes
     tie = _TIE
-    if course.lane.any() and not model.precise:
-        tie = _COARSE_CHANGE_TIE if model.has_both_lanes(course) else math.inf
+    if course.lane.any():
+        tie = math.inf if not model.has_both_lanes(course) else _TIE if model.precise else _COARSE_CHANGE_TIE
     others = [rival for total, _, rival in rivals if total < least + tie and _farthest(course, rival)[1] >= _ANOTHER_M]
     last = model.trace(_last_lane_m(course)) if course.lane.any() else course
     side = _sides_of(last, station_m, left_m)
-    return DrivenLane(side, course, tuple(others), last, tuple(_lanes_beside(model, last, station_m, left_m, named)))
+    beside = _lanes_beside(model, last, station_m, left_m, named)
+    if _is_crossed(beside):
+        others.append(course)
+    return DrivenLane(side, course, tuple(others), last, tuple(beside))
 
 
 def describe_tie(chosen: DrivenLane, drive: DrivenLine) -> str:
@@ -240,7 +245,10 @@ class _Model:
         share, sigma = _STEP_M / length_m, math.hypot(accuracy, _DRIVER_M)
         line = _line_costs(stage_m, station_m, left_m, grid)
         prior = np.minimum((grid / sigma) ** 2, _MAX_PRIOR) * share
-        slope = _slopes(stage_m, station_m, left_m, grid) * (stage_m[1] - stage_m[0]) / _GRID_M
+        slope = _slopes(stage_m, station_m, left_m, grid, _PAIR_M)
+        if np.isnan(slope).mean() > _MAX_UNKNOWN:  # markers far apart
+            slope = _slopes(stage_m, station_m, left_m, grid, _WIDE_PAIR_M)
+        slope = _through_gaps(slope, stage_m, drive) * (stage_m[1] - stage_m[0]) / _GRID_M
         return cls(stage_m, grid, line, prior, slope, sigma, precise)
 
     def cheapest(self, allowed: Bools | None = None, *, with_changes: bool = True) -> tuple[float, LaneCourse]:
@@ -282,7 +290,7 @@ class _Model:
             for at, centre_m in ((before, new_m), (after, old_m)):
                 near = np.abs(self.grid - centre_m[:, None]) < _TRACE_M
                 least = np.where(near[:, None], self.line[at], np.inf).min((1, 2))
-                if (least > _NO_LINE_COST).any():
+                if np.mean(least <= _NO_LINE_COST) < _BOTH_SHARE:
                     return False
         return True
 
@@ -361,10 +369,12 @@ def _follow(
             for w in range(widths):
                 for g in range(size):
                     best, at = np.inf, g
-                    middle = g - round(slope[b, g])
+                    known = not math.isnan(slope[b, g])
+                    middle = g - round(slope[b, g]) if known else g
                     for h in range(max(middle - _MAX_MOVE, 0), min(middle + _MAX_MOVE + 1, size)):
-                        off = g - h - slope[b, g]
-                        value = total[b - 1, m, w, h] + min(price[0] * off * off, most)
+                        value = total[b - 1, m, w, h]
+                        if known:
+                            value += min(price[0] * (g - h - slope[b, g]) ** 2, most)
                         if m == _KEEPING:
                             value += price[1] * (g - h) * (g - h)
                         if value < best:
@@ -431,31 +441,48 @@ def _line_costs(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats
     return out
 
 
-def _slopes(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats) -> Floats:
-    """Direction of the lines beside the track at each station, shape (B, G); 0 where markers show none.
+def _slopes(stage_m: Floats, station_m: Floats, left_m: Floats, grid: Floats, pair_m: tuple[float, float]) -> Floats:
+    """Direction of the lines beside the track at each station, shape (B, G); NaN where markers show none.
 
     It is the one in which most pairs of neighbouring markers lie. A vehicle that changes lane crosses the lines.
     """
     tried: Floats = np.arange(-_MAX_SLOPE, _MAX_SLOPE + _SLOPE_STEP / 2, _SLOPE_STEP)
     coarse: Floats = np.linspace(grid[0], grid[-1], 9)
-    out = np.zeros((len(stage_m), len(grid)))
+    out = np.empty((len(stage_m), len(grid)))
+    nearest = np.rint(np.interp(grid, coarse, np.arange(len(coarse)))).astype(int)
     order = np.argsort(station_m)
     ranked, left = station_m[order], left_m[order]
-    ends = np.searchsorted(ranked, ranked + _PAIR_M[1], side="right")
+    ends = np.searchsorted(ranked, ranked + pair_m[1], side="right")
     first = np.repeat(np.arange(len(ranked)), ends - np.arange(len(ranked)))
     second = np.concatenate([np.arange(k, end) for k, end in enumerate(ends)])
     apart = ranked[second] - ranked[first]
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (left[second] - left[first]) / apart
-    kept = (apart > _PAIR_M[0]) & (np.abs(slope) <= _MAX_SLOPE) & (np.abs(left[second] - left[first]) < _PAIR_ACROSS_M)
+    kept = (apart > pair_m[0]) & (np.abs(slope) <= _MAX_SLOPE) & (np.abs(left[second] - left[first]) < _PAIR_ACROSS_M)
     middle_m, across, slope = ((ranked[second] + ranked[first]) / 2)[kept], left[first][kept], slope[kept]
     agree = np.exp(-(((slope[:, None] - tried) / (2.5 * _SLOPE_STEP)) ** 2) / 2)
     for b, at in enumerate(stage_m):
         near = np.abs(middle_m - at + (stage_m[1] - stage_m[0]) / 2) < _SLOPE_REACH_M / 2
         here = across[near] + slope[near] * (at - middle_m[near])
         weight = np.exp(-(((here - coarse[:, None]) / _SLOPE_ACROSS_M) ** 2) / 2) @ agree[near]
-        best = tried[np.argmax(weight, 1)] * (weight.max(1) >= _MIN_PAIRS)
-        out[b] = np.interp(grid, coarse, best)
+        best = tried[np.argmax(weight, 1)]
+        wanted = np.where(np.abs(best) > _STEEP, _MIN_STEEP_PAIRS, _MIN_PAIRS)
+        out[b] = np.where(weight.max(1) >= wanted, best, np.nan)[nearest]
+    return out
+
+
+def _through_gaps(slope: Floats, stage_m: Floats, drive: DrivenLine) -> Floats:
+    """Directions where markers are missing: lines bend evenly there, in the plane rather than beside the track."""
+    _, tangent = drive.line.points_at((stage_m + np.concatenate([stage_m[:1], stage_m[:-1]])) / 2)
+    yaw = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    out = slope.copy()
+    for g in range(slope.shape[1]):
+        known = np.flatnonzero(~np.isnan(slope[:, g]))
+        for first, last in itertools.pairwise(known.tolist()):
+            if 1 < last - first <= _MAX_GAP:
+                inner = np.arange(first + 1, last)
+                line = np.interp(inner, (first, last), (slope[[first, last], g] + yaw[[first, last]]))
+                out[inner, g] = np.clip(line - yaw[inner], -_MAX_SLOPE, _MAX_SLOPE)
     return out
 
 
@@ -522,6 +549,17 @@ def _lanes_beside(
             side = np.where(inside, side, UNKNOWN)
             found.append(CourseBeside(sign * position, _direction(side, named), course, side))
     return found
+
+
+def _is_crossed(beside: list[CourseBeside]) -> bool:
+    """Whether a lane on one side ends where one on the other side begins, as if the path ran from lane to lane."""
+    left, right = ([lane.course.station_m for lane in beside if lane.position == sign] for sign in (1, -1))
+    return any(
+        abs(before[-1] - after[0]) < _CROSSED_M and before[0] < after[0] and before[-1] < after[-1]
+        for one in left
+        for other in right
+        for before, after in ((one, other), (other, one))
+    )
 
 
 def _direction(side: Ints, named: Ints) -> bool | None:
