@@ -33,8 +33,9 @@ serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000
 PYTEST := $(BIN)/python -m pytest --durations=30
 
 # A process for each core, each of which imports everything: 50 CPU seconds. Slow tests wait for other processes.
+# QUICK names files, if only their quick tests are to be run.
 test: $(VENV)/.dev ## The quick tests; `make check` runs all
-	$(PYTEST) -n logical --dist worksteal -m "not slow" -p no:schemathesis $(PYTEST_ARGS)
+	$(PYTEST) -n logical --dist worksteal -m "not slow" -p no:schemathesis $(QUICK) $(PYTEST_ARGS)
 
 slow: $(VENV)/.dev
 	$(PYTEST) -n 4 --dist loadfile -m slow $(PYTEST_ARGS)
