@@ -33,6 +33,7 @@ from app.lanes.lane_fit import LaneFit
 from app.lanes.lane_path import (
     compare_with_track,
     find_departure,
+    has_gaps,
     path_from_fit,
     path_from_splines,
     refused_path,
@@ -63,6 +64,16 @@ _TRACK_APART = (
     "the vehicle's track does not run beside the path, so that nothing shows that the path is in its place: check the "
     "datum and the survey of the markers, and of the receiver"
 )
+_TRACK_REVERSED = (
+    "the markers were received in the opposite order to that in which the vehicle's track passes them: check the times "
+    "and the order of the track's positions"
+)
+_SIDES_REVERSED = (
+    "the sides sent by the markers are those of the other direction of travel: the path follows the order in which the "
+    "markers were received"
+)
+_MIN_HEARD, _MIN_HEARD_M = 6, 60.0  # markers, and the length along which they are [m], whose order shows a direction
+_SURE_ORDER = 0.6  # rank correlation of place and time
 _BEYOND_TRACK_M = 15.0  # [m] further past its ends a track is not used; sensitivity 1.00, 1.00
 _PRECISE_TRACK_M = 0.1  # [m] noise of a track that shows sides by itself; between RTK and other receivers
 _NOT_ALONG = (
@@ -130,12 +141,17 @@ def fit_lane(
     if line is None:
         reason = "the markers do not lie along a lane, or are one row without a known side"
         return refused_path(observations, notes, reason, "waymark")
+    order = _order_heard(line if drive is None else drive.line, observations, taken, strengths)
+    if drive is None and order < -_SURE_ORDER:
+        line, observations = SmoothLine(line.points_m[::-1]), _with_sides_exchanged(observations, notes)
     alone = notes.copy()
-    lane = _fit_by_least_squares(observations, taken, line, drive, rules, alone)
+    lane = _fit_by_least_squares(observations, taken, line, drive, rules, alone, is_directed=abs(order) > _SURE_ORDER)
     if lane is not None and lane.refusal is None and drive is not None:
         outer = _of_outer_rows(lane, observations)
         if outer.any():
             lane = _fit_own_markers(observations, taken, taken & ~outer, line, drive, rules, notes)
+    if lane is None and drive is not None and track is not None and has_gaps(track.time_s):
+        lane = _fit_past_gaps(observations, taken, drive, rules, notes)
     if lane is None and drive is not None and track is not None:
         lane = _fit_driven_lane(observations, taken, drive, strengths, track, rules, notes)
     if lane is None:
@@ -143,7 +159,11 @@ def fit_lane(
         return refused_path(observations, alone, reason, "waymark")
     if track is None:
         return lane
-    return _compared_with_track(lane, _track_in_lane(lane, track), drive)
+    lane = _compared_with_track(lane, _track_in_lane(lane, track), drive, observations)
+    if drive is not None and lane.refusal is None and order < -_SURE_ORDER:
+        warnings = (*lane.localization_warnings, _TRACK_REVERSED)
+        return replace(lane, track_apart=True, localization_warnings=warnings)
+    return lane
 
 
 def preview_m(lane: Lane, lon_deg: float, lat_deg: float) -> float:
@@ -155,6 +175,43 @@ def preview_m(lane: Lane, lon_deg: float, lat_deg: float) -> float:
     here = plane_from_wgs84(np.array([lon_deg]), np.array([lat_deg]), origin)
     nearest = int(np.argmin(np.hypot(*(lane.position_enu_m - here).T)))
     return float(lane.station_m[-1] - lane.station_m[nearest])
+
+
+# --- direction of travel ---------------------------------------------------------------------------------------------
+
+
+def _order_heard(
+    line: SmoothLine, observations: LaneObservations, taken: Bools, strengths: PacketStrengths | None
+) -> float:
+    """Rank correlation of where markers are along a line with when they were heard best; 0 where it is not clear.
+
+    A log has it without a track, too.
+    """
+    if strengths is None or not len(strengths.time_s):
+        return 0.0
+    number, place = np.unique(observations.number[taken], return_index=True)
+    row = np.searchsorted(number, strengths.number).clip(0, len(number) - 1)
+    good = (number[row] == strengths.number) & np.isfinite(strengths.time_s)
+    row, time_s, rssi_dbm = row[good], strengths.time_s[good], np.nan_to_num(strengths.rssi_dbm[good], nan=-100.0)
+    heard, of_heard = np.unique(row, return_inverse=True)
+    if len(heard) < _MIN_HEARD:
+        return 0.0
+    strongest = np.full(len(heard), -np.inf)
+    np.maximum.at(strongest, of_heard, rssi_dbm)
+    weight = 10.0 ** ((rssi_dbm - strongest[of_heard]) / 10.0)
+    passed_s = np.bincount(of_heard, weight * (time_s - time_s.min())) / np.bincount(of_heard, weight)
+    along_m, _ = line.project(observations.point_m[taken][place[heard]])
+    if np.ptp(along_m) < _MIN_HEARD_M or np.ptp(passed_s) <= 0:
+        return 0.0
+    return float(np.corrcoef(np.argsort(np.argsort(along_m)), np.argsort(np.argsort(passed_s)))[0, 1])
+
+
+def _with_sides_exchanged(observations: LaneObservations, notes: Notes) -> LaneObservations:
+    """Markers of a lane that is driven against its sides."""
+    side = observations.side
+    if (side != UNKNOWN).any():
+        notes.warn(_SIDES_REVERSED)
+    return replace(observations, side=np.where(side == LEFT, RIGHT, np.where(side == RIGHT, LEFT, UNKNOWN)))
 
 
 # --- initial line -------------------------------------------------------------------------------------------------
@@ -184,10 +241,22 @@ def _initial_line(
         if (side[taken] == UNKNOWN).all() and drive.sigma_m < _PRECISE_TRACK_M:
             beside = ~beyond & (np.abs(left) < _MAX_BESIDE_TRACK_M)
             side = np.where(beside, np.where(left > 0, LEFT, RIGHT), UNKNOWN)
+    return _line_of_markers(observations, taken, side, drive, rules, notes)
+
+
+def _line_of_markers(
+    observations: LaneObservations,
+    taken: Bools,
+    side: Ints,
+    drive: DrivenLine | None,
+    rules: LaneRules,
+    notes: Notes,
+) -> tuple[SmoothLine | None, Bools]:
+    """A line through the markers of the largest group, in the direction of the vehicle's track if there is one."""
     belongs = _connected_markers(observations, taken, rules, notes)
     if belongs.sum() < 2:
         return None, belongs
-    line = fit_initial_line(observations.point_m[belongs], side[belongs], half)
+    line = fit_initial_line(observations.point_m[belongs], side[belongs], rules.usual_width_m / 2)
     if line is not None and drive is not None:
         at, _ = line.project(drive.line.points_m)
         if np.sum(np.diff(at)) < 0:
@@ -215,8 +284,13 @@ def _fit_by_least_squares(
     drive: DrivenLine | None,
     rules: LaneRules,
     notes: Notes,
+    *,
+    is_directed: bool = False,
 ) -> Lane | None:
-    """Waymark's method, with reasons to refuse a lane; None where the markers share no line."""
+    """Waymark's method, with reasons to refuse a lane; None where the markers share no line.
+
+    `is_directed`: the direction of travel is known without a track.
+    """
 
     def refused(reason: str) -> Lane:
         return refused_path(observations, notes, reason, "waymark")
@@ -237,14 +311,28 @@ def _fit_by_least_squares(
         return None
     if _is_row_of_unknown_side(fit, observations, taken, drive):
         return refused("one row of markers, and nothing shows on which side of the lane it is")
-    _warn_of_guessed_sides(fit, observations, drive, notes)
+    _warn_of_guessed_sides(fit, observations, notes, is_guessed=drive is None and not is_directed)
     lane = path_from_fit(fit, observations, rules, notes)
     if not len(lane.sigma_m) or float(np.median(lane.sigma_m)) > rules.max_median_sigma_m:
         return refused("the markers are too few or too inaccurate to show where the lane runs")
     return lane
 
 
-def _compared_with_track(lane: Lane, track: PoseTrack, drive: DrivenLine | None) -> Lane:
+def _fit_past_gaps(
+    observations: LaneObservations, taken: Bools, drive: DrivenLine, rules: LaneRules, notes: Notes
+) -> Lane | None:
+    """The lane by its markers alone, where the track was interrupted, as in a tunnel, and is inaccurate after that."""
+    noted = notes.copy()
+    line, belongs = _line_of_markers(observations, taken, observations.side, drive, rules, noted)
+    if line is None:
+        return None
+    lane = _fit_by_least_squares(observations, belongs, line, None, rules, noted, is_directed=True)
+    return lane if lane is not None and lane.refusal is None else None
+
+
+def _compared_with_track(
+    lane: Lane, track: PoseTrack, drive: DrivenLine | None, observations: LaneObservations
+) -> Lane:
     """A lane with its agreement with the track, and with warnings where the path is elsewhere or has another shape."""
     agreement = compare_with_track(lane, track)
     if agreement is None:
@@ -252,10 +340,14 @@ def _compared_with_track(lane: Lane, track: PoseTrack, drive: DrivenLine | None)
             return lane
         warnings = (*lane.localization_warnings, _TRACK_APART)
         return replace(lane, track_apart=True, localization_warnings=warnings)
-    if (departure := find_departure(lane, track)) is not None:
+    off_line = [out.row for out in lane.left_out if out.reason is LeftOutReason.OFF_THE_LINE]
+    of_row = observations.of_row[off_line]
+    departure = find_departure(lane, track, observations.point_m[of_row[of_row >= 0]])
+    if departure is not None:
         warning = (
             f"{departure.station_m:.0f} m along it the path turns aside where the vehicle does not, by "
-            f"{departure.rms_m:.1f} m: check the datum and the survey of the markers there"
+            f"{abs(departure.aside_m):.1f} m to the {'left' if departure.aside_m > 0 else 'right'}: check the datum "
+            "and the survey of the markers there"
         )
         warnings = (*lane.localization_warnings, warning)
         return replace(lane, track_agreement=agreement, track_apart=True, localization_warnings=warnings)
@@ -493,12 +585,10 @@ def _is_row_of_unknown_side(
     return len(_sides_found(fit)) == 1 or is_single_row(observations.point_m[taken], fit.station_m[taken])
 
 
-def _warn_of_guessed_sides(
-    fit: LaneFit, observations: LaneObservations, drive: DrivenLine | None, notes: Notes
-) -> None:
+def _warn_of_guessed_sides(fit: LaneFit, observations: LaneObservations, notes: Notes, *, is_guessed: bool) -> None:
     if len(_sides_found(fit)) == 1:
         notes.warn("only one side of the lane was received: the path is half the usual width beside it")
-    if drive is None and not (observations.side[fit.used] != UNKNOWN).any():
+    if is_guessed and not (observations.side[fit.used] != UNKNOWN).any():
         notes.warn(
             "neither a track nor a marker shows a side: sides are guessed, and the direction of travel may be the "
             "opposite one"

@@ -253,6 +253,14 @@ _SLOW_SHARE = 0.3  # of a receiver's error that changes along the track like wan
 _ROUNDS = 12  # of finding the nearest places on the path; converged to a millimetre
 _CONVERGED_M = 1e-3  # [m]
 _OUTLIER_SIGMAS = 3.0  # from which on a fix counts less (Huber)
+_STEP_FIXES, _MAX_STEP_INTERVAL_S = 3, 0.25  # [1, s] fixes before and after a step, and the longest time between fixes
+_MIN_STEP_M, _STEP_SPREADS = 0.25, 10.0  # [m, 1] that is one, and its size in the median of all
+_GAP_S, _CONVERGING_S = 3.0, 15.0  # [s] without a fix, as in a tunnel, and how long positions are inaccurate after it
+_MIN_CONVERGED = 0.5  # share of fixes, below which inaccurate ones are used, too
+_PRECISE_M = 0.3  # [m] of a receiver that shows whether a vehicle is in its lane
+_BESIDE_LANE_M = 0.5  # [m] from a boundary
+_BODY_M = 1.0  # [m] half of a car with its mirrors; its driver keeps it between the boundaries
+_MIN_LEAVES_M, _MIN_LEAVES_SIGNIFICANCE = 0.65, 2.5  # [m, 1] a path so far from a vehicle is not that of its lane
 
 
 class _Compared(NamedTuple):
@@ -286,13 +294,14 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
     """
     if not len(lane.station_m) or np.isnan(lane.curvature_per_m).any() or (np.abs(track.lat_deg) > 90).any():
         return None
-    fixes, spacing_m = _thinned(
-        plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
-    )
-    accuracy = _accuracy_m(track, _OPTIMISM)
+    plane = plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
+    fixes, spacing_m = _thinned(plane[_converged(track.time_s)])
+    accuracy = _accuracy_m(track, plane, _OPTIMISM)
     wander = math.hypot(_WANDER_SD_M, _SLOW_SHARE * accuracy) * math.sqrt(max(2 * _WANDER_LENGTH_M / spacing_m, 1.0))
     tree = scipy.spatial.cKDTree(lane.position_enu_m)
     fixes = fixes[np.asarray(tree.query(fixes)[0]) < _MAX_BESIDE_M]
+    if accuracy < _PRECISE_M:
+        fixes = fixes[_in_lane(lane, tree, fixes)]
     if len(fixes) < _MIN_FIXES:
         return None
     middle, values = fixes.mean(0), np.zeros(6)
@@ -304,7 +313,7 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
         values, covariance = _solve(compared, middle, values, wander)
         if np.abs(_transformed(fixes, middle, values) - moved).max() < _CONVERGED_M:
             break
-    return _agreement(compared, middle, values, covariance, accuracy)
+    return _agreement(compared, middle, values, covariance, accuracy, _half_width_m(lane))
 
 
 def runs_apart(lane: Lane, track: PoseTrack) -> bool:
@@ -327,10 +336,62 @@ def runs_apart(lane: Lane, track: PoseTrack) -> bool:
     return nearest_m > _APART_M or min(moved_m, float(lane.station_m[-1])) > _MIN_LENGTH_M
 
 
-def _accuracy_m(track: PoseTrack, optimism: float = 1.0) -> float:
-    """Accuracy of a track's receiver: what it states times a factor, or that of one without corrections. [m]"""
+def _accuracy_m(track: PoseTrack, fixes_m: Floats, optimism: float = 1.0) -> float:
+    """Accuracy of a track's receiver: what it states times a factor, or that of one without corrections. [m]
+
+    A receiver that steps is not more accurate than its largest step.
+    """
     stated = track.accuracy_m[np.isfinite(track.accuracy_m)]
-    return optimism * max(float(np.median(stated)), 0.0) if len(stated) else UNKNOWN_ACCURACY_M
+    accuracy_m = optimism * max(float(np.median(stated)), 0.0) if len(stated) else UNKNOWN_ACCURACY_M
+    return max(accuracy_m, _largest_step_m(track.time_s, fixes_m))
+
+
+def _in_lane(lane: Lane, tree: scipy.spatial.cKDTree, fixes_m: Floats) -> Bools:
+    """Fixes of a vehicle that has not left its lane, as for overtaking; all of them, if it was hardly in one."""
+    if not len(fixes_m):
+        return np.ones(0, bool)
+    at = np.asarray(tree.query(fixes_m)[1])
+    yaw = np.radians(90.0 - lane.heading_deg[at])
+    off = np.sum(np.stack([-np.sin(yaw), np.cos(yaw)], 1) * (fixes_m - lane.position_enu_m[at]), 1)
+    inside = np.abs(off - np.median(off)) < _half_width_m(lane) + _BESIDE_LANE_M
+    return inside if inside.mean() >= _MIN_CONVERGED else np.ones(len(inside), bool)
+
+
+def _half_width_m(lane: Lane) -> float:
+    """Half of a lane's width, or of a usual one. [m]"""
+    known = lane.width_m[np.isfinite(lane.width_m)]
+    return float(np.median(known)) / 2 if len(known) else LaneRules().usual_width_m / 2
+
+
+def _largest_step_m(time_s: Floats, fixes_m: Floats) -> float:
+    """How far positions step, from a few fixes to the next few, beyond how the vehicle moves; 0 if they do not. [m]"""
+    few = _STEP_FIXES
+    if len(time_s) < 4 * few or np.median(np.diff(time_s)) > _MAX_STEP_INTERVAL_S:
+        return 0.0
+    windows = np.lib.stride_tricks.sliding_window_view(fixes_m, 2 * few, axis=0)
+    times = np.lib.stride_tricks.sliding_window_view(time_s, 2 * few)
+    speed = np.median(np.diff(windows, axis=2) / np.diff(times)[:, None], axis=2)
+    moved = np.median(windows[:, :, few:], 2) - np.median(windows[:, :, :few], 2)
+    lapse = np.median(times[:, few:], 1) - np.median(times[:, :few], 1)
+    step_m = np.hypot(*(moved - speed * lapse[:, None]).T)
+    dense = times[:, -1] - times[:, 0] < 3 * few * _MAX_STEP_INTERVAL_S
+    largest_m = float(step_m[dense].max(initial=0.0))
+    return largest_m if largest_m > max(_MIN_STEP_M, _STEP_SPREADS * float(np.median(step_m))) else 0.0
+
+
+def has_gaps(time_s: Floats) -> bool:
+    """Whether a track was interrupted, as in a tunnel. Times in seconds, rising."""
+    return bool((np.diff(time_s) > _GAP_S).any())
+
+
+def _converged(time_s: Floats) -> Bools:
+    """Fixes that are not just after a gap; all of them, if too few are left."""
+    ends = time_s[1:][np.diff(time_s) > _GAP_S]
+    if not len(ends):
+        return np.ones(len(time_s), bool)
+    last = np.searchsorted(ends, time_s, side="right") - 1
+    good = (last < 0) | (time_s - ends[np.maximum(last, 0)] > _CONVERGING_S)
+    return good if good.mean() >= _MIN_CONVERGED else np.ones(len(time_s), bool)
 
 
 def _thinned(fixes_m: Floats) -> tuple[Floats, float]:
@@ -379,7 +440,12 @@ def _solve(compared: _Compared, middle_m: Floats, values: Floats, noise_m: float
 
 
 def _agreement(
-    compared: _Compared, middle_m: Floats, values: Floats, covariance: Floats, accuracy_m: float
+    compared: _Compared,
+    middle_m: Floats,
+    values: Floats,
+    covariance: Floats,
+    accuracy_m: float,
+    half_width_m: float,
 ) -> TrackAgreement:
     shift, turn, scale = values[:2], float(values[2]), float(values[3])
     reach_m = math.sqrt(float(np.mean(np.sum((compared.fix_m - middle_m) ** 2, 1))))
@@ -393,6 +459,9 @@ def _agreement(
     alone = max(shift_z, abs(turn) / turn_sigma, abs(scale) / scale_sigma)
     significance = max(alone, _joint_significance(values[:4], covariance[:4, :4] + receiver))
     effect_m = float(np.sqrt(np.mean(across**2)))
+    leaves_m = max(_MIN_LEAVES_M, half_width_m - _BODY_M)
+    disagrees = significance > MAX_TRACK_SIGNIFICANCE and effect_m > MIN_TRACK_EFFECT_M
+    disagrees |= significance > _MIN_LEAVES_SIGNIFICANCE and effect_m > leaves_m and accuracy_m < _PRECISE_M
     return TrackAgreement(
         east_m=float(shift[0]),
         north_m=float(shift[1]),
@@ -403,7 +472,7 @@ def _agreement(
         scale_sigma_ppm=1e6 * scale_sigma,
         significance=significance,
         effect_m=effect_m,
-        disagrees=significance > MAX_TRACK_SIGNIFICANCE and effect_m > MIN_TRACK_EFFECT_M,
+        disagrees=disagrees,
     )
 
 
@@ -423,52 +492,149 @@ def _joint_significance(values: Floats, covariance: Floats) -> float:
 
 # === Whether a path turns aside where the vehicle drives on.
 #
-# Within a few tens of metres neither a driver nor a receiver's slow error moves far across the lane. Where the path
-# does, markers of one stretch are surveyed in another datum, or the path cuts a corner because true markers were left
-# out. What a constant error of the receiver explains, in its own direction, is no departure.
+# Within a few tens of metres a driver hardly moves across the lane. Where the path does, the markers from there on are
+# surveyed in another datum, or the path cuts a corner because true markers were left out. Headings show it best: they
+# do not step or drift as positions do. What a constant error of the heading explains, or one of the positions, which
+# compares a bend with the wrong place of it, is no departure; nor is one of the vehicle, whose own heading turns aside.
 
 
-_WINDOW_M = 36.0  # [m] three spacings of the paper
-_MIN_IN_WINDOW = 8  # steps of the track
-_MIN_DEPARTURE_M, _DEPARTURE_SHARE = 0.4, 0.5  # [m, 1] that is reported; share of the receiver's accuracy
-_SLOW_ERROR_M = 10.0  # [m] of a receiver, on each axis; it is the same within a window
+_SPANS_M = (24.0, 48.0)  # [m] within which a path moves across; two and four spacings of the paper
+_AROUND_M = 60.0  # [m] before and after, where constant errors are learnt
+_MIN_AROUND = 8  # steps of the track there
+_MIN_ASIDE_M, _ASIDE_SIGMAS, _CLEAR_SIGMAS = 0.5, 5.0, 3.0  # [m, 1, 1] that is reported; where the path clearly turns
+_BUMP_PER_M, _CLEAR_BUMP = 0.02, 0.03  # [rad/m, rad] by which the path turns aside and back more than the vehicle
+_SLOW_DRIFT = 0.2  # share of a receiver's accuracy by which its error changes in between
+_HEADING_SD = 0.03  # [rad] of a step's heading
+_MAX_GAP_M = 45.0  # [m] between two fixes of a receiver of 1 Hz on a motorway
+_HEADING_OFF = 0.35  # [rad] headings that differ more from the path are not the vehicle's
+_DOUBTFUL_REACH_M = 30.0  # [m] from a marker that was left out, where the path may be at fault
 
 
 class Departure(NamedTuple):
-    """Where a path departs most from the vehicle's track, but for a constant error of the receiver."""
+    """Where a path turns aside and the vehicle does not."""
 
     station_m: float  # [m] of the path
-    rms_m: float  # [m] within a window, across the path
+    aside_m: float  # [m] to the left of the vehicle's course
 
 
-def find_departure(lane: Lane, track: PoseTrack) -> Departure | None:
-    """Where a path departs from the shape of the vehicle's track; None if it does not, or too little is beside it."""
+def find_departure(lane: Lane, track: PoseTrack, doubtful_m: Floats) -> Departure | None:
+    """Where a path departs most from the shape of the vehicle's track; None if it does not, or too little is beside it.
+
+    Parameters
+    ----------
+    doubtful_m : ndarray, shape (N, 2)
+        Markers that were left out because they are off the line, in the lane's frame. [m]
+
+    Notes
+    -----
+    Beside the path, the vehicle's direction less the path's is b + e k + noise, with a constant error b of headings, a
+    constant error e of positions along the path, and the path's curvature k. Both are estimated before and after a
+    stretch; what is left within it, summed over its length, is how far the path moves across.
+    """
     if not len(lane.station_m) or np.isnan(lane.curvature_per_m).any() or (np.abs(track.lat_deg) > 90).any():
         return None
-    fixes, spacing_m = _thinned(
-        plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
-    )
-    if len(fixes) < 2:
+    steps = _steps_beside(lane, track)
+    if len(steps.at) < 2 * _MIN_AROUND:
         return None
+    plane = plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
+    accuracy_m = _accuracy_m(track, plane)
+    doubtful = np.zeros(len(steps.at), bool)
+    if len(doubtful_m):
+        near, _ = scipy.spatial.cKDTree(doubtful_m).query(lane.position_enu_m[steps.at])
+        doubtful = np.asarray(near) < _DOUBTFUL_REACH_M
+    shortest = max(round(_SPANS_M[0] / steps.length_m / 2), 1)
+    turns_aside = _bump(steps.path_yaw, shortest) - _bump(steps.track_yaw, shortest)
+    worst: tuple[float, Departure | None] = (1.0, None)
+    for span_m in _SPANS_M:
+        half = max(round(span_m / steps.length_m / 2), 1)
+        aside_m, seeming_m = _aside(steps, half, accuracy_m)
+        seen = np.isfinite(aside_m)
+        if not seen.any():
+            continue
+        spread_m = 1.4826 * float(np.median(np.abs(aside_m[seen])))
+        bump = np.asarray(scipy.ndimage.maximum_filter1d(turns_aside, 2 * (half - shortest) + 1, mode="nearest"))
+        ratio = np.zeros(len(steps.at))
+        bump -= _BUMP_PER_M * np.abs(np.nan_to_num(aside_m))
+        for sigmas, of_path in ((_ASIDE_SIGMAS, (bump > 0) | doubtful), (_CLEAR_SIGMAS, bump > _CLEAR_BUMP)):
+            limit_m = np.maximum(_MIN_ASIDE_M, sigmas * spread_m) + sigmas * seeming_m
+            ratio = np.maximum(ratio, np.where(seen & of_path, np.abs(aside_m) / limit_m, 0.0))
+        k = int(np.argmax(ratio))
+        if ratio[k] > worst[0]:
+            worst = float(ratio[k]), Departure(float(lane.station_m[steps.at[k]]), -float(aside_m[k]))
+    return worst[1]
+
+
+class _Steps(NamedTuple):
+    """Even steps of a track beside a path, each shape (T,)."""
+
+    at: Ints  # station of the path beside it
+    path_yaw: Floats  # [rad] anticlockwise from east, unwrapped
+    track_yaw: Floats  # [rad] likewise
+    curvature_per_m: Floats  # of the path
+    seen: Bools  # fixes show it, rather than those before and after a gap
+    length_m: float  # of a step
+
+
+def _steps_beside(lane: Lane, track: PoseTrack) -> _Steps:
+    """Positions and headings of a track at even steps, where it is beside a path."""
+    plane = plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
+    along, good = lengths_along(plane), _converged(track.time_s)
+    length_m = max(_SPACING_M, float(along[-1]) / _MAX_STEPS)
+    first, which, count = np.unique((along[good] / length_m).astype(np.int64), return_inverse=True, return_counts=True)
+    step = np.arange(first[0], first[-1] + 1)
+
+    def even(values: Floats) -> Floats:
+        return np.interp(step, first, np.bincount(which, values[good]) / count)
+
+    fixes = np.stack([even(plane[:, 0]), even(plane[:, 1])], 1)
+    yaw = np.radians(90.0 - track.heading_deg)
+    headings = np.arctan2(even(np.sin(yaw)), even(np.cos(yaw)))  # NaN where one is not known
     far, index = (np.asarray(found) for found in scipy.spatial.cKDTree(lane.position_enu_m).query(fixes))
-    keep = (index > 0) & (index < len(lane.station_m) - 1) & (far < _MAX_BESIDE_M)
-    at, fixes = index[keep], fixes[keep]
-    width = round(_WINDOW_M / spacing_m)
-    if len(at) < max(width, _MIN_IN_WINDOW):
-        return None
-    yaw = np.radians(90.0 - lane.heading_deg[at])
-    normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
-    off = np.sum(normal * (fixes - lane.position_enu_m[at]), 1)
+    kept = np.flatnonzero((index > 0) & (index < len(lane.station_m) - 1) & (far < _MAX_BESIDE_M))
+    index, fixes = index[kept], fixes[kept]
+    path = np.unwrap(np.radians(90.0 - lane.heading_deg))
+    ahead = np.stack([np.cos(path[index]), np.sin(path[index])], 1)
+    station_m = lane.station_m[index] + np.sum(ahead * (fixes - lane.position_enu_m[index]), 1)
+    path_yaw = np.interp(station_m, lane.station_m, path)
+    off = np.angle(np.exp(1j * (headings[kept] - path_yaw)))
+    if not np.isfinite(off).all() or (len(off) and np.median(np.abs(off)) > _HEADING_OFF):
+        course = np.gradient(fixes, axis=0) if len(fixes) > 1 else np.zeros_like(fixes)
+        off = np.angle(np.exp(1j * (np.arctan2(course[:, 1], course[:, 0]) - path_yaw)))
+    gap = np.searchsorted(first, step[kept])
+    seen = (first[gap] - first[np.maximum(gap - 1, 0)]) * length_m <= max(_MAX_GAP_M, length_m)
+    seen |= first[gap] == step[kept]
+    return _Steps(index, path_yaw, path_yaw + off, lane.curvature_per_m[index], seen, length_m)
 
-    def windows(values: Floats) -> Floats:
-        total = np.cumsum(np.concatenate([np.zeros((1, *values.shape[1:])), values]), axis=0)
-        return np.asarray(total[width:] - total[:-width])
 
-    squares = windows(normal[:, :, None] * normal[:, None, :]) + np.eye(2) / _SLOW_ERROR_M**2
-    mixed = windows(normal * off[:, None])
-    explained = np.einsum("wi,wi->w", mixed, np.linalg.solve(squares, mixed[:, :, None])[:, :, 0])
-    rms = np.sqrt(np.maximum(windows(off**2) - explained, 0.0) / width)
-    worst = int(np.argmax(rms))
-    if rms[worst] < max(_MIN_DEPARTURE_M, _DEPARTURE_SHARE * _accuracy_m(track)):
-        return None
-    return Departure(float(lane.station_m[at[worst + width // 2]]), float(rms[worst]))
+def _aside(steps: _Steps, half: int, accuracy_m: float) -> tuple[Floats, Floats]:
+    """How far the vehicle moves to the left of the path within so many steps before and after each one, NaN where that
+    is not known; and what it seems to (1 sigma), because it is compared with the wrong place of a bend. [m, m]
+    """
+    count, around = len(steps.at), half + round(_AROUND_M / steps.length_m)
+    off, bend = steps.track_yaw - steps.path_yaw, steps.curvature_per_m
+    terms = np.where(steps.seen[:, None], np.stack([np.ones(count), bend, bend * bend, off, bend * off], 1), 0.0)
+    total = np.concatenate([np.zeros((1, terms.shape[1])), np.cumsum(terms, axis=0)])
+    place = np.arange(count)
+
+    def within(reach: int) -> Floats:
+        return np.asarray(total[np.minimum(place + reach + 1, count)] - total[np.maximum(place - reach, 0)])
+
+    inner = within(half)
+    n, k, kk, d, kd = (within(around) - inner).T
+    prior_m = 2 * accuracy_m + _MIN_ASIDE_M  # of the position's error
+    kk = kk + (_HEADING_SD / prior_m) ** 2
+    determinant = np.maximum(n * kk - k * k, 1e-12)
+    constant, along_m = (kk * d - k * kd) / determinant, (n * kd - k * d) / determinant
+    aside_m = steps.length_m * (inner[:, 3] - constant * inner[:, 0] - along_m * inner[:, 1])
+    sigma_m = np.hypot(_HEADING_SD * np.sqrt(n / determinant), _SLOW_DRIFT * accuracy_m)
+    whole = (inner[:, 0] == 2 * half + 1) & (n >= _MIN_AROUND)
+    return np.where(whole, aside_m, np.nan), sigma_m * np.abs(steps.length_m * inner[:, 1])
+
+
+def _bump(yaw: Floats, half: int) -> Floats:
+    """How much a direction turns aside and back again around each step. [rad]"""
+    smooth = scipy.ndimage.uniform_filter1d(yaw, max(half // 2, 1), mode="nearest")
+    second = np.zeros(len(yaw))
+    if len(yaw) > 2 * half:
+        second[half:-half] = np.abs(smooth[2 * half :] - 2 * smooth[half:-half] + smooth[: -2 * half])
+    return np.asarray(scipy.ndimage.maximum_filter1d(second, 2 * half + 1, mode="nearest"))

@@ -1,6 +1,6 @@
 """``python -m benchmarks.cerpm [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: path, lanes, spoof, forged, dirty, tracking, routes, radio, europe, speed, physics, all.
+Items: path, lanes, shape-errors, spoof, forged, dirty, tracking, routes, radio, europe, speed, physics, all.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from benchmarks.cerpm.europe import run_europe
 from benchmarks.cerpm.packets_and_steering import run_forged, run_radio, run_routes, run_speed, run_tracking
 from benchmarks.cerpm.paths import Result, run_dirty, run_path, run_spoof
 from benchmarks.cerpm.physics import run_physics
+from benchmarks.cerpm.shape_errors import run_shape_errors
 
 RUNS: dict[str, Callable[[int, bool], Result]] = {
-    "path": run_path, "lanes": run_lanes, "spoof": run_spoof, "forged": run_forged, "dirty": run_dirty,
+    "path": run_path, "lanes": run_lanes, "shape-errors": run_shape_errors, "spoof": run_spoof, "forged": run_forged,
+    "dirty": run_dirty,
     "tracking": run_tracking, "routes": run_routes, "radio": run_radio, "europe": run_europe, "speed": run_speed,
     "physics": run_physics,
 }  # fmt: skip

@@ -64,9 +64,10 @@ def test_axe_finds_nothing_on_any_page(
     found, too_wide = {}, []
     for path in pages:
         watched.open(path.format(**ids))
-        for scheme, rules in (("light", ()), ("dark", ("color-contrast",))):  # only colours differ
+        for scheme in ("light", "dark"):
             watched.page.emulate_media(color_scheme=scheme)
             wait_until_quiet(watched)
+            rules = ["color-contrast"] if scheme == "dark" else []  # only colours differ
             if faults := audit(watched, *rules):
                 found[f"{path}, {scheme}"] = faults
         if phone:
