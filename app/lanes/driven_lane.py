@@ -62,6 +62,7 @@ _COARSE_CHANGE_TIE = 35.0  # squared sigmas; an inaccurate receiver's slow error
 # with registered lines, courses differ less by chance; fitted with `benchmarks.cerpm lanes`, seeds 201 to 203
 _REGISTERED_TIE, _REGISTERED_COARSE_CHANGE_TIE = 10.0, 20.0  # squared sigmas
 _REGISTERED_SHARE = 0.9  # of the markers beside the track whose registered line can be used
+_MAX_CONTRADICTED = 0.2  # of the markers with registered lines; beyond, none of these is used
 _REGISTERED_GAP_M = 60.0  # [m] between markers of a line that runs between them; five spacings
 _LINES_APART_M = 1.0  # [m] between two registered lines, or of a marker from its own; less than half of a lane
 _MAX_RIVALS = 4  # lanes that are compared with the driven one
@@ -263,7 +264,8 @@ def find_registered_lines(station_m: Floats, left_m: Floats, line: Ints | None) 
     """Lines that are registered and that the places of their markers do not contradict.
 
     A marker contradicts its line if it is farther from both of its neighbours on it, to the same side, than lines are
-    apart. Two lines contradict each other where they cross, at angles at which roads do not.
+    apart. Two lines contradict each other where they cross, at angles at which roads do not. Where many markers do, no
+    line is used.
 
     Parameters
     ----------
@@ -288,8 +290,10 @@ def find_registered_lines(station_m: Floats, left_m: Floats, line: Ints | None) 
         known += len(row)
     start, end = np.concatenate(starts), np.concatenate(ends)
     crossed = _crossing(start, end)
-    contradicted += int(crossed.sum())
-    return RegisteredLines(start[~crossed], end[~crossed], (known - int(crossed.sum())) / len(point), contradicted)
+    known, contradicted = known - int(crossed.sum()), contradicted + int(crossed.sum())
+    if contradicted > _MAX_CONTRADICTED * (known + contradicted):
+        return RegisteredLines(start[:0], end[:0], 0.0, contradicted)
+    return RegisteredLines(start[~crossed], end[~crossed], known / len(point), contradicted)
 
 
 def _crossing(start: Floats, end: Floats) -> Bools:

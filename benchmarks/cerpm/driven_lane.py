@@ -55,8 +55,8 @@ def run_lanes(seed: int, short: bool) -> Result:
         f"centre line of the driven lane is within {GOALS_M['2 cm']:g} m with a receiver of 2 cm, and within "
         f"{GOALS_M['2 m']:g} m with one of 2 m, {END_M:g} m at both ends left out; after a change of lane, the driven "
         "lane is the last one. Wrong paths that are called fit to localize a vehicle are silent errors. The same "
-        "drives are decoded without registered lines, with the line of each marker registered as the commit of a plan does, and "
-        "with 5 % of the markers registered on another line of the road."
+        "drives are decoded without registered lines, with the line of each marker registered as the commit of a plan "
+        "does, and with 5 % of the markers registered on another line of the road."
     )
     head = ("road", "receiver", "lines registered", "drives", "right", "refused", "wrong", "silent", "worst RMS [m]")
     return note, head, rows
