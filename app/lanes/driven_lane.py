@@ -59,7 +59,7 @@ _TRACE_M = 1.1  # [m] of a lane's centre from where it was expected
 _NEARER_COST = 0.05  # [1/m] squared sigmas at each station, so that the next lane comes before the one after it
 _MIN_STRETCH, _MAX_BESIDE = 5, 2  # stations of a lane that is named, and such lanes on each side
 _COARSE_CHANGE_TIE = 35.0  # squared sigmas; an inaccurate receiver's slow errors look like changes of lane
-# with registered lines, courses differ less by chance; fitted with `benchmarks.cerpm lanes`, seeds 201 to 203
+# with registered lines, courses differ less by chance: `benchmarks.cerpm lanes`, chosen with seed 201
 _REGISTERED_TIE, _REGISTERED_COARSE_CHANGE_TIE = 10.0, 20.0  # squared sigmas
 _REGISTERED_SHARE = 0.9  # of the markers beside the track whose registered line can be used
 _MAX_CONTRADICTED = 0.2  # of the markers with registered lines; beyond, none of these is used
