@@ -41,7 +41,7 @@ from app.formats.poses import read_poses
 from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.parts import open_parts
 from app.geodesy import LocalizationGrade, decimal_year, move_to_epoch
-from app.lanes.types import Lane, LaneMarkers, LaneRules, PacketStrengths
+from app.lanes.types import NO_LINE, Lane, LaneMarkers, LaneRules, PacketStrengths
 from app.markers.cerpm import MAX_INVALID_TAGS_PER_LOG, LaneSide, SpeedLimit, SpeedUnit, derive_marker_key
 from app.markers.magnet import InformationTag, parse_tag
 from app.markers.magnet_design import INFORMATION_TAG, MagnetSpec, meaning_of
@@ -266,11 +266,17 @@ def read_packets_of(
     )
 
 
-def lane_markers(merged: MergedMarkers) -> LaneMarkers:
-    """Merged markers as the lane's fit takes them."""
+def lane_markers(read: ReadPackets) -> LaneMarkers:
+    """Merged markers as the lane's fit takes them, with the lines of the road that are registered for them."""
+    merged, numbers = read.merged, list[int]()
+    names: dict[tuple[str | None, str], int] = {}
+    for number in read.merged.number.tolist():
+        name = None if (row := read.known.rows.get(number)) is None else line_of(row)
+        numbers.append(NO_LINE if name is None else names.setdefault(name, len(names)))
     return LaneMarkers(
-        merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh
-    )
+        merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_kmh,
+        np.array(numbers, np.int64),
+    )  # fmt: skip
 
 
 def packet_strengths(verification: Verification) -> PacketStrengths:
@@ -335,6 +341,12 @@ def speed_limit_of(row: MarkerRow) -> SpeedLimit | None:
 def side_of(row: MarkerRow) -> LaneSide:
     """Lane side of a CERPM's row."""
     return LaneSide[row.spec["side"].upper()]
+
+
+def line_of(row: MarkerRow) -> tuple[str | None, str] | None:
+    """Road and name of the line on which a CERPM is registered; None where none is."""
+    name: str | None = row.spec.get("line")
+    return None if name is None else (row.road, name)
 
 
 def radio_of(row: MarkerRow) -> RadioSettings:

@@ -82,6 +82,8 @@ def message_of(row: MarkerRow, sequence: int = 0) -> CerpmMessage:
 
 
 Side = Literal["left", "right", "unknown"]
+Line = Annotated[str, Field(min_length=1, max_length=300)]
+LINE_TEXT = "Line of its road on which it stands: CERPMs with the same road and line are on one line."
 DevEui = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{16}$"), AfterValidator(str.lower)]
 
 
@@ -118,6 +120,7 @@ class CerpmIn(Headed, MarkerIn):
         None, description="Within the agency; the next free one if left out."
     )
     side: Side = Field("unknown", description="Boundary of the lane that it is on, in the direction of travel.")
+    line: Line | None = Field(None, description=f"{LINE_TEXT} The commit of a plan names it.")
     speed_limit: SpeedLimit | None = Field(None, description="As it is posted; nothing where none is.")
     dev_eui: DevEui | None = Field(None, description="LoRaWAN DevEUI, where the marker joins a network.")
     radio: RadioSettings = Field(default_factory=RadioSettings)
@@ -127,6 +130,7 @@ class CerpmChange(FamilyChange):
     """Members of a change that CERPMs have."""
 
     side: Side = Field("unknown", description="Of a CERPM.")
+    line: Line | None = Field(None, description="Of a CERPM.")
     speed_limit: SpeedLimit | None = Field(None, description="Of a CERPM.")
     dev_eui: DevEui | None = Field(None, description="Of a CERPM.")
     radio: RadioSettings = Field(
@@ -151,6 +155,7 @@ class CerpmDocument(MarkerDocument):
     family: Literal["cerpm"]
     code: CerpmCodeDocument
     side: Side
+    line: str | None
     speed_limit: SpeedLimit | None
     dev_eui: str | None
     radio: RadioSettings
@@ -164,6 +169,7 @@ def cerpm_document(row: MarkerRow) -> CerpmDocument:
         "family": "cerpm",
         "code": {"scheme": "cerpm", "text": row.digits, "number": int(row.digits)},
         "side": spec["side"],
+        "line": spec.get("line"),
         "speed_limit": spec["speed_limit"],
         "dev_eui": spec["dev_eui"],
         "radio": spec["radio"],
@@ -178,6 +184,7 @@ class CerpmSurveyIn(BaseModel):
     """Members of a survey's declaration that CERPMs have."""
 
     side: Side = Field("unknown", description="Of CERPMs without one of their own.")
+    line: Line | None = Field(None, description=f"Of all CERPMs of the file. {LINE_TEXT}")
     speed_limit: SpeedLimit | None = Field(None, description="Of CERPMs.")
 
 
@@ -277,15 +284,25 @@ def _read_numbers(survey: GeoreferencedSurvey, rows: Rows) -> tuple[RowCodes, li
 
 def _specs(defaults: CerpmSurveyIn) -> dict[str, dict[str, object]]:
     """What CERPMs of each side keep; rows share these, and none changes them."""
-    return {side: _spec(side, defaults.speed_limit, RadioSettings()) for side in get_args(Side)}
+    return {side: _spec(side, defaults.speed_limit, RadioSettings(), line=defaults.line) for side in get_args(Side)}
 
 
 def _spec(
-    side: str, speed_limit: SpeedLimit | None, radio: RadioSettings, dev_eui: str | None = None
+    side: str,
+    speed_limit: SpeedLimit | None,
+    radio: RadioSettings,
+    *,
+    line: str | None = None,
+    dev_eui: str | None = None,
 ) -> dict[str, object]:
-    """What the row of a CERPM has in its column `spec`."""
+    """What the row of a CERPM has in its column `spec`; later surveys keep it."""
     limit = None if speed_limit is None else {"value": speed_limit.value, "unit": speed_limit.unit.value}
-    return {"side": side, "speed_limit": limit, "dev_eui": dev_eui, "radio": asdict(radio)}
+    return {"side": side, "line": line, "speed_limit": limit, "dev_eui": dev_eui, "radio": asdict(radio)}
+
+
+def line_in_plan(plan_id: str, marker: PlannedMarker) -> str:
+    """Name of the line that a planned CERPM marks: a boundary of the first lane of its plan that has this boundary."""
+    return f"{plan_id} {marker.lane} {'left' if marker.offset_m > 0 else 'right'}".strip()
 
 
 def _placed_radios(radio: RadioSettings, markers: Sequence[PlannedMarker]) -> list[RadioSettings]:
@@ -352,7 +369,7 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
             "digits": str(number),
             "heading_deg": new.heading_deg,
             **position_columns(new.position, prepared),
-            "spec": _spec(new.side, new.speed_limit, new.radio, new.dev_eui),
+            "spec": _spec(new.side, new.speed_limit, new.radio, line=new.line, dev_eui=new.dev_eui),
         }
         message_of(row_of(MarkerRow, columns))
         return columns
@@ -397,7 +414,8 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
         for marker, radio in zip(markers, radios, strict=True):
             detail = marker.detail
             assert isinstance(detail, PlannedCerpm)
-            spec = _spec(detail.side.name.lower(), detail.speed_limit, radio)
+            line = line_in_plan(commitment.plan_id, marker)
+            spec = _spec(detail.side.name.lower(), detail.speed_limit, radio, line=line)
             columns = {"scheme": "cerpm", "digits": str(detail.number), "spec": spec}
             yield PlannedRow(marker.number, commitment.position(marker) | columns)
 

@@ -6,6 +6,10 @@ none within, and its centre is as near to the track as the receiver's error and 
 that changes lane crosses a boundary: its lane is then the next one. How many markers a line has is no evidence, and the
 sides that markers send decide only which lanes are oncoming ones: a line that two lanes share is left of one and right
 of the other. How strongly markers were received while the vehicle passed them shows which of them are near.
+
+Where the registry knows on which line of the road markers stand, that line runs between them, also where others were
+not received. Registered lines are evidence beside the markers themselves: where they contradict the markers' places,
+they are not used.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import numpy as np
 
 from app.compiled import ieee_kernel
 from app.lanes.initial_line import TRUSTED_TRACK_M, UNKNOWN_ACCURACY_M, DrivenLine
-from app.lanes.types import LEFT, RIGHT, UNKNOWN
+from app.lanes.types import LEFT, NO_LINE, RIGHT, UNKNOWN
 from app.values import Bools, Floats, Ints
 
 _STEP_M = 12.5  # [m] between stations; about the paper's spacing of 12.2 m
@@ -55,6 +59,12 @@ _TRACE_M = 1.1  # [m] of a lane's centre from where it was expected
 _NEARER_COST = 0.05  # [1/m] squared sigmas at each station, so that the next lane comes before the one after it
 _MIN_STRETCH, _MAX_BESIDE = 5, 2  # stations of a lane that is named, and such lanes on each side
 _COARSE_CHANGE_TIE = 35.0  # squared sigmas; an inaccurate receiver's slow errors look like changes of lane
+# with registered lines, courses differ less by chance: `benchmarks.cerpm lanes`, chosen with seed 201
+_REGISTERED_TIE, _REGISTERED_COARSE_CHANGE_TIE = 10.0, 20.0  # squared sigmas
+_REGISTERED_SHARE = 0.9  # of the markers beside the track whose registered line can be used
+_MAX_CONTRADICTED = 0.2  # of the markers with registered lines; beyond, none of these is used
+_REGISTERED_GAP_M = 60.0  # [m] between markers of a line that runs between them; five spacings
+_LINES_APART_M = 1.0  # [m] between two registered lines, or of a marker from its own; less than half of a lane
 _MAX_RIVALS = 4  # lanes that are compared with the driven one
 _ONCOMING_COST = 30.0  # squared sigmas for a lane whose both boundaries send the other side
 _ONCOMING_SHARE = 0.7  # of the markers on each boundary that send the other side
@@ -143,10 +153,16 @@ class DrivenLane:
     others: tuple[LaneCourse, ...]  # equally likely lanes; none where the driven one is certain
     last_lane: LaneCourse  # the lane in which the vehicle is at the end, along the whole track
     beside: tuple[CourseBeside, ...]  # other lanes
+    contradicted: int = 0  # markers whose places contradict the lines that are registered for them
 
 
 def choose_driven_lane(
-    station_m: Floats, left_m: Floats, named: Ints, drive: DrivenLine, passing: Passing = NOTHING_PASSED
+    station_m: Floats,
+    left_m: Floats,
+    named: Ints,
+    drive: DrivenLine,
+    passing: Passing = NOTHING_PASSED,
+    line: Ints | None = None,
 ) -> DrivenLane | None:
     """Find the driven lane among all markers beside a track; None where no lane contains the track.
 
@@ -158,12 +174,16 @@ def choose_driven_lane(
         `LaneSide` that each marker sends.
     passing : Passing
         How strongly markers were received that the vehicle passed.
+    line : ndarray of int, shape (K,), optional
+        Registered line of each marker; NO_LINE where none is registered.
     """
     beside = np.abs(left_m) < _HALF_GRID_M + _WIDTHS_M[-1]
     if beside.sum() < 2:
         return None
     stage = _stages(station_m[beside])
-    model = _Model.of(stage, station_m[beside], left_m[beside], drive)
+    lines = find_registered_lines(station_m[beside], left_m[beside], None if line is None else line[beside])
+    along, across = lines.points(stage)
+    model = _Model.of(stage, np.append(station_m[beside], along), np.append(left_m[beside], across), drive)
     found = [*model.likely(with_changes=False), *model.likely(with_changes=True)]
     weak = _unexpected_strength([course for _, course in found], station_m, left_m, passing)
     lanes = sorted(
@@ -177,16 +197,18 @@ def choose_driven_lane(
     if not lanes:
         return None
     (least, _, course), *rivals = lanes
-    tie = _TIE
+    tie, change_tie = _TIE, _COARSE_CHANGE_TIE
+    if lines.known_share >= _REGISTERED_SHARE:
+        tie, change_tie = _REGISTERED_TIE, _REGISTERED_COARSE_CHANGE_TIE
     if course.lane.any():
-        tie = math.inf if not model.has_both_lanes(course) else _TIE if model.precise else _COARSE_CHANGE_TIE
+        tie = math.inf if not model.has_both_lanes(course) else tie if model.precise else change_tie
     others = [rival for total, _, rival in rivals if total < least + tie and _farthest(course, rival)[1] >= _ANOTHER_M]
     last = model.trace(_last_lane_m(course)) if course.lane.any() else course
     side = _sides_of(last, station_m, left_m)
     beside = _lanes_beside(model, last, station_m, left_m, named)
     if _is_crossed(beside):
         others.append(course)
-    return DrivenLane(side, course, tuple(others), last, tuple(beside))
+    return DrivenLane(side, course, tuple(others), last, tuple(beside), lines.contradicted)
 
 
 def describe_tie(chosen: DrivenLane, drive: DrivenLine) -> str:
@@ -221,6 +243,67 @@ def _farthest(course: LaneCourse, other: LaneCourse) -> tuple[int, float]:
 def _stages(station_m: Floats) -> Floats:
     first, last = float(station_m.min()), float(station_m.max())
     return np.linspace(first, last, max(math.ceil((last - first) / _STEP_M), 1) + 1)
+
+
+class RegisteredLines(NamedTuple):
+    """Where registered lines run: links between neighbouring markers of one line."""
+
+    start: Floats  # shape (N, 2): [m] along and left of the track
+    end: Floats  # shape (N, 2), farther along
+    known_share: float  # of all markers
+    contradicted: int  # markers whose places contradict the lines that are registered for them
+
+    def points(self, stage_m: Floats) -> tuple[Floats, Floats]:
+        """Where the lines pass the stations, along and left of the track, shape (P,) each. [m]"""
+        link, at = np.nonzero((self.start[:, :1] < stage_m) & (stage_m < self.end[:, :1]))
+        share = (stage_m[at] - self.start[link, 0]) / (self.end[link, 0] - self.start[link, 0])
+        return stage_m[at], self.start[link, 1] + share * (self.end[link, 1] - self.start[link, 1])
+
+
+def find_registered_lines(station_m: Floats, left_m: Floats, line: Ints | None) -> RegisteredLines:
+    """Lines that are registered and that the places of their markers do not contradict.
+
+    A marker contradicts its line if it is farther from both of its neighbours on it, to the same side, than lines are
+    apart. Two lines contradict each other where they cross, at angles at which roads do not. Where many markers do, no
+    line is used.
+
+    Parameters
+    ----------
+    station_m, left_m : ndarray, shape (K,)
+        Of the markers, along and left of the track. [m]
+    line : ndarray of int, shape (K,), or None
+        NO_LINE where none is registered.
+    """
+    point = np.stack([station_m, left_m], 1)
+    starts, ends, known, contradicted = [np.empty((0, 2))], [np.empty((0, 2))], 0, 0
+    for which in np.unique(line[line != NO_LINE]) if line is not None else ():
+        row = point[line == which]
+        row = row[np.argsort(row[:, 0])]
+        before, after = row[1:-1, 1] - row[:-2, 1], row[1:-1, 1] - row[2:, 1]
+        off = np.zeros(len(row), bool)
+        off[1:-1] = (before * after > 0) & (np.minimum(np.abs(before), np.abs(after)) > _LINES_APART_M)
+        row, contradicted = row[~off], contradicted + int(off.sum())
+        length, across = np.diff(row, axis=0).T
+        linked = (length > 0) & (length < _REGISTERED_GAP_M) & (np.abs(across) <= _MAX_SLOPE * length)
+        starts.append(row[:-1][linked])
+        ends.append(row[1:][linked])
+        known += len(row)
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    crossed = _crossing(start, end)
+    known, contradicted = known - int(crossed.sum()), contradicted + int(crossed.sum())
+    if contradicted > _MAX_CONTRADICTED * (known + contradicted):
+        return RegisteredLines(start[:0], end[:0], 0.0, contradicted)
+    return RegisteredLines(start[~crossed], end[~crossed], known / len(point), contradicted)
+
+
+def _crossing(start: Floats, end: Floats) -> Bools:
+    """Which of the links between markers cross another one, shape (N,)."""
+    low, high = np.maximum(start[:, None, 0], start[:, 0]), np.minimum(end[:, None, 0], end[:, 0])
+    slope = (end[:, 1] - start[:, 1]) / (end[:, 0] - start[:, 0])
+    first, last = (start[:, None, 1] + slope[:, None] * (at - start[:, None, 0]) for at in (low, high))
+    first, last = first - first.T, last - last.T
+    apart = np.minimum(np.abs(first), np.abs(last)) > _LINES_APART_M / 2
+    return np.asarray(((low < high) & (first * last < 0) & apart).any(1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

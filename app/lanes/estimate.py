@@ -83,6 +83,11 @@ _NOT_ALONG = (
 _STILL_CHANGING = (
     "the vehicle changes lane until the end of the log, so that nothing shows in which lane it is: send a longer log"
 )
+_CONTRADICTED = (
+    "the positions of {} markers contradict the lines of the road that are registered for them: these are not used "
+    "there; check the lines in the registry"
+)
+_MIN_CONTRADICTED = 2  # a single marker may have been moved
 _MIN_FIXES = 10  # of the track in the lane to which the vehicle changed
 _MAX_GAP_M = 25.0  # [m] without a marker of the driven lane, beside markers of others; two spacings
 _MAX_ACROSS_M = 1.6  # [m] that an accurate track moves across its lane; half of a lane
@@ -404,9 +409,13 @@ def _fit_driven_lane(
     if not taken.any():
         return None
     heard = _passing(strengths, track, observations, taken, drive)
-    chosen = choose_driven_lane(along[taken], left[taken], observations.side[taken], drive, heard)
+    chosen = choose_driven_lane(
+        along[taken], left[taken], observations.side[taken], drive, heard, observations.line[taken]
+    )
     if chosen is None or (chosen.side != UNKNOWN).all():
         return None
+    if chosen.contradicted >= _MIN_CONTRADICTED:
+        notes.warn(_CONTRADICTED.format(chosen.contradicted))
     if chosen.others:
         return refused_path(observations, notes, describe_tie(chosen, drive), "waymark")
     course = chosen.course

@@ -30,6 +30,7 @@ class LaneObservations:
     # `sigma_m`, `speed_limit_kmh`: shape (M,)
     sigma_m: Floats
     speed_limit_kmh: Floats
+    line: Ints  # shape (M,): registered line of the road; NO_LINE where none is registered
     of_row: Ints  # shape (K,): row of these for each row of `LaneMarkers`; -1 for none
 
 
@@ -65,6 +66,7 @@ def observations_from_markers(markers: LaneMarkers, rules: LaneRules, notes: Not
         side=side[good],
         sigma_m=sigma[first][good],
         speed_limit_kmh=markers.speed_limit_kmh[chosen][good],
+        line=markers.line[chosen][good],
         of_row=of_row,
     )
 

@@ -33,6 +33,7 @@ class MarkerPlace:
 MAX_TRACK_SIGNIFICANCE = 4.5  # standard deviations above which path and track disagree; 1 in 150,000
 MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; a lane leaves as much room
 UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, LaneSide.RIGHT))
+NO_LINE = -1  # of a marker whose line is not registered
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,11 +54,15 @@ class LaneMarkers:
     side: Ints  # shape (K,): `LaneSide` values
     sigma_m: Floats  # shape (K,): [m] standard deviation of the survey on each axis; 0.02 m where it is not known
     speed_limit_kmh: Floats  # shape (K,): [km/h] NaN where none is posted
+    # shape (K,): registered line of the road on which each stands; NO_LINE where none is registered, as without a value
+    line: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
+        if not np.size(self.line):
+            object.__setattr__(self, "line", np.full(np.size(self.number), NO_LINE))
         lengths = set()
         for name in self.__slots__:
-            kind = np.int64 if name in ("number", "side") else np.float64
+            kind = np.int64 if name in ("number", "side", "line") else np.float64
             try:
                 values = np.asarray(getattr(self, name))
                 if kind is np.int64 and values.size and not np.issubdtype(values.dtype, np.integer):

@@ -19,7 +19,7 @@ from app.lanes.types import MarkerPlace
 from app.markers.cerpm import LaneSide
 from app.planning.cerpm_placement import place_markers
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_between, make_lane
-from app.values import Floats
+from app.values import Floats, Ints
 from benchmarks.cerpm.scenes import LIMIT, SURVEY_M
 
 LENGTH_M = 500.0
@@ -39,6 +39,7 @@ class Topology:
     installed: InstalledMarkers  # of all lanes; chainages are along their own lanes
     own: frozenset[int]  # numbers of markers on the boundaries of the driven lane
     course: TrueLane  # between its boundaries the vehicle drives: the lane, but where it changes lane
+    line: Ints  # of each installed marker, as a plan registers it: the boundary of the lane that placed it first
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,9 @@ def _topology(driven: TrueLane, parts: list[InstalledMarkers]) -> Topology:
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     installed = replace(parts[0], **arrays)
     beside = np.minimum(_nearest_m(installed.point_m, driven.left_m), _nearest_m(installed.point_m, driven.right_m))
-    return Topology(driven, installed, frozenset(installed.number[beside < _ROW_M / 2].tolist()), driven)
+    own = frozenset(installed.number[beside < _ROW_M / 2].tolist())
+    line = np.concatenate([3 * number + part.side for number, part in enumerate(parts)])
+    return Topology(driven, installed, own, driven, line)
 
 
 def _nearest_m(points_m: Floats, line_m: Floats) -> Floats:

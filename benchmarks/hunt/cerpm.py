@@ -11,14 +11,24 @@ import numpy as np
 
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
+from app.decoding.recordings import packet_strengths
 from app.errors import InvalidParameter
 from app.lanes.estimate import Lane, LaneMarkers, fit_lane
+from app.lanes.initial_line import TRUSTED_TRACK_M
+from app.lanes.types import PacketStrengths
 from app.markers.cerpm import LaneSide
 from app.planning.cerpm_placement import place_markers
 from app.plots.lane import picture_of_lane, plot_lane
 from app.sensors.pose_track import PoseTrack
 from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_lane, drive_past, observe_track
-from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lose_row, lose_share
+from app.simulation.radio.lanes import (
+    InstalledMarkers,
+    TrueLane,
+    install_markers,
+    lane_between,
+    lose_row,
+    lose_share,
+)
 from app.simulation.radio.link import Radio
 from benchmarks.cerpm.path_errors import TOLERANCE_M, PlaceErrors, place_errors
 from benchmarks.cerpm.scenes import LIMIT, ROUTE_NAMES, keys_for, markers_from_merged, route, sign
@@ -73,6 +83,11 @@ DRIVE = {
     "slow_time_s": Bound(10, 120, 20, "multipath and troposphere", logarithmic=True),
     "without_track": switch("a log of packets alone", plain=0.85),
 }
+BESIDE = {
+    "lane_beside": Bound(0, 2, 0, "none, a marked lane on the left, or one on the right", whole=True, plain=0.8),
+    "lines_registered": switch("committed plans register the line of each marker"),
+    "lines_wrong": Bound(0, 0.1, 0, "registered on the other line of the road", plain=0.7),
+}
 _WRONG_M, _LIMIT_WRONG_M = (
     1.0,
     0.5,
@@ -91,6 +106,7 @@ class _Drive(NamedTuple):
     receiver: SatelliteReceiver
     span_m: tuple[float, float]
     numbers: set[int]
+    strengths: PacketStrengths
 
 
 class CerpmScenes:
@@ -99,7 +115,7 @@ class CerpmScenes:
     The badness of a failure is an error in metres, or in standard deviations where these are too small.
     """
 
-    bounds: Mapping[str, Bound] = {**ROAD, **MARKERS, **DRIVE}
+    bounds: Mapping[str, Bound] = {**ROAD, **MARKERS, **DRIVE, **BESIDE}
 
     def evaluate(self, parameters: Parameters, seed: int) -> Outcome:
         """Decode a drive, and compare its path with the true centre line and with the oracle's path."""
@@ -147,18 +163,55 @@ def _simulate(p: Parameters, seed: int) -> _Drive | None:
         return None
     honest = lose_row(installed, row, rng, side)
     sent, dishonest = _with_mistakes(p, lane, honest, rng)
+    sent, line = _with_lane_beside(p, lane, sent, np.random.default_rng([seed, 4]))
     driver = Driver(speed_m_s=p["speed_m_s"], wander_sd_m=p["wander_sd_m"], habit_sd_m=p["habit_sd_m"])
     accuracy = float(np.hypot(p["white_sd_m"], p["slow_sd_m"]))
     receiver = SatelliteReceiver(p["white_sd_m"], p["slow_sd_m"], p["slow_time_s"], 1.0, accuracy)
     radio = Radio(interval_s=p["interval_s"], shadow_sd_db=p["shadow_sd_db"])
     passed = drive_past(lane, sent, rng, sign=sign, radio=radio, driver=driver, receiver=receiver)
-    merged = merge_markers(verify_packets(list(passed.packets), keys_for(sent)).packets, {}, None)
-    heard = markers_from_merged(merged)
+    verification = verify_packets(list(passed.packets), keys_for(sent))
+    heard = markers_from_merged(merge_markers(verification.packets, {}, None))
+    if p.get("lines_registered") and p.get("lane_beside"):
+        heard = replace(heard, line=np.array([line[number] for number in heard.number.tolist()]))
     numbers = set(heard.number.tolist()) - {int(honest.number[k]) for k in dishonest}
     chainage = honest.chainage_m[np.isin(honest.number, list(numbers))]
     if len(chainage) < 4:
         return None
-    return _Drive(lane, honest, heard, passed.track, receiver, (chainage.min(), chainage.max()), numbers)
+    span_m, strengths = (chainage.min(), chainage.max()), packet_strengths(verification)
+    return _Drive(lane, honest, heard, passed.track, receiver, span_m, numbers, strengths)
+
+
+def _with_lane_beside(
+    p: Parameters, lane: TrueLane, own: InstalledMarkers, rng: np.random.Generator
+) -> tuple[InstalledMarkers, dict[int, int]]:
+    """Markers of a lane beside, which shares a line with the driven one, and the line on which each is registered."""
+    line = dict(zip(own.number.tolist(), own.side.tolist(), strict=True))
+    if not p.get("lane_beside"):  # kept scenes are older
+        return own, line
+    on_left = p["lane_beside"] == 1
+    normal = np.stack([-np.sin(lane.yaw_rad), np.cos(lane.yaw_rad)], 1) * p["width_m"]
+    left, right = (lane.left_m + normal, lane.left_m) if on_left else (lane.right_m, lane.right_m - normal)
+    beside = lane_between(left[::8], right[::8], lane.origin)
+    outer = LaneSide.LEFT if on_left else LaneSide.RIGHT
+    places = place_markers(beside.left_m, beside.right_m, spacing_m=p["spacing_m"])
+    other = install_markers(
+        beside, [place for place in places if place.side == outer], rng, speed_limit=LIMIT,
+        survey_sd_m=p["survey_sd_m"], first_number=1 + int(own.number.max()),
+    )  # fmt: skip
+    names = [one.name for one in fields(own) if one.name != "speed_limit"]
+    both: dict[str, Any] = {name: np.concatenate([getattr(own, name), getattr(other, name)]) for name in names}
+    line |= dict.fromkeys(other.number.tolist(), 3)
+    wrong = rng.random(len(line)) < p["lines_wrong"]
+    line = {
+        number: int(rng.integers(1, 4)) if off else true
+        for (number, true), off in zip(line.items(), wrong, strict=True)
+    }
+    return replace(own, **both), line
+
+
+def _is_sure_of_lane(p: Parameters, drive: _Drive) -> bool:
+    """Whether the receiver can show in which of two lanes the vehicle is."""
+    return not p.get("lane_beside") or (not p["without_track"] and drive.receiver.reported_accuracy_m < TRUSTED_TRACK_M)
 
 
 def _with_mistakes(
@@ -183,7 +236,7 @@ def _with_mistakes(
 
 
 def _decode(p: Parameters, drive: _Drive) -> Lane:
-    return fit_lane(drive.heard, None if p["without_track"] else drive.track)
+    return fit_lane(drive.heard, None if p["without_track"] else drive.track, strengths=drive.strengths)
 
 
 def _oracle_markers(p: Parameters, drive: _Drive) -> LaneMarkers:
@@ -213,7 +266,8 @@ def _judge(p: Parameters, drive: _Drive, path: Lane, oracle: Lane) -> Outcome:
     if found is None or blocked or found.coverage < _MIN_COVERED:
         alone = bool(p["without_track"]) and bool(p["without_sides"])  # nothing shows the direction of travel
         said = path.refusal or ("blocked by the track" if blocked else f"{found.coverage if found else 0:.0%} covered")
-        return Outcome(Kind.MISSED if possible and not alone else Kind.BEYOND, 1.0, said)
+        missed = possible and not alone and _is_sure_of_lane(p, drive)
+        return Outcome(Kind.MISSED if missed else Kind.BEYOND, 1.0, said)
     sure = found.confidence > 0.5
     step = max(round(_EVERY_M / 0.25), 1)
     readings = [

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 import scipy
 
+from app.lanes.driven_lane import find_registered_lines
 from app.lanes.estimate import fit_lane
-from app.lanes.types import LaneMarkers, LeftOutReason, PacketStrengths
+from app.lanes.types import NO_LINE, Lane, LaneMarkers, LeftOutReason, PacketStrengths
 from app.plots.lane import picture_of_lane, plot_lane
 from app.simulation.radio.drive import Multipath, SatelliteReceiver, drive_past
 from benchmarks.cerpm.path_errors import place_errors
 from benchmarks.cerpm.scenes import markers_for_lane, track
-from benchmarks.cerpm.topologies import TOPOLOGIES, make_topology
+from benchmarks.cerpm.topologies import TOPOLOGIES, Topology, make_topology
 
 
 @pytest.mark.parametrize("name", list(TOPOLOGIES))
@@ -167,3 +168,73 @@ def test_a_path_that_turns_aside_where_the_vehicle_does_not_is_unfit() -> None:
     wrong = fit_lane(moved, track(road.lane, np.random.default_rng(92)))
     assert wrong.refusal is not None or wrong.track_apart
     assert wrong.refusal is not None or any("turns aside" in text for text in wrong.localization_warnings)
+
+
+def fitted_with_lines(road: Topology, line: list[int] | np.ndarray, seed: int, receiver: SatelliteReceiver) -> Lane:
+    """The path of a drive whose packets have the strengths that the receiver hears."""
+    heard = drive_past(road.course, road.installed, np.random.default_rng(seed), sign=None, receiver=receiver)
+    strengths = PacketStrengths(
+        road.installed.number[heard.sender],
+        np.array([packet.received_at_s for packet in heard.packets]),
+        np.array([packet.rssi_dbm for packet in heard.packets]),
+    )
+    was_heard = np.isin(np.arange(len(road.installed)), heard.sender)
+    markers = replace(markers_for_lane(road.installed.chosen(was_heard)), line=np.asarray(line)[was_heard])
+    return fit_lane(markers, heard.track, strengths=strengths)
+
+
+def test_registered_lines_decide_drives_that_markers_alone_do_not() -> None:
+    refused = {True: 0, False: 0}
+    for seed in range(301, 307):
+        road = make_topology("two lanes, shared line", np.random.default_rng(seed))
+        for known in (True, False):
+            line = road.line if known else np.full(len(road.line), NO_LINE)
+            lane = fitted_with_lines(road, line, seed, SatelliteReceiver.plain())
+            refused[known] += lane.refusal is not None
+            if lane.refusal is None:
+                errors = place_errors(road.lane, lane, 30.0, road.lane.length_m - 30.0)
+                assert errors is not None
+                assert errors.rms_m < 0.1
+            assert not any("registered" in text for text in lane.localization_warnings)
+    assert refused[True] < refused[False]
+
+
+@pytest.mark.parametrize("wrong", ["tenth", "all", "one line"])
+def test_lines_that_are_registered_wrongly_give_a_warning_and_no_other_path(wrong: str) -> None:
+    rng = np.random.default_rng(95)
+    road = make_topology("three lanes", rng)
+    markers, driven = markers_for_lane(road.installed), track(road.lane, rng)
+    drawn = rng.choice(np.unique(road.line), len(road.line))
+    share = {"tenth": 0.1, "all": 1.0, "one line": 0.0}[wrong]
+    line = np.where(rng.random(len(drawn)) < share, drawn, 0 if wrong == "one line" else road.line)
+    lane = fit_lane(replace(markers, line=line), driven)
+    assert any("contradict the lines of the road" in text for text in lane.localization_warnings)
+    errors = place_errors(road.lane, lane, 30.0, road.lane.length_m - 30.0)
+    assert errors is not None
+    assert errors.rms_m < 0.045
+
+
+def test_registered_lines_run_where_markers_are_missing() -> None:
+    along = np.concatenate([np.arange(0.0, 100.0, 12.0), [150.0, 250.0]])
+    lines = find_registered_lines(along, 0.01 * along, np.full(len(along), 4))
+    station, left = lines.points(np.array([-5.0, 30.0, 125.0, 200.0, 260.0]))
+    assert station.tolist() == [30.0, 125.0]  # neither beyond its ends nor through a gap of 100 m
+    assert left == pytest.approx(0.01 * station)
+    assert (lines.known_share, lines.contradicted) == (1.0, 0)
+    assert not len(find_registered_lines(along, along, np.full(len(along), NO_LINE)).start)
+
+
+def test_lines_that_cross_and_markers_off_their_line_are_not_used() -> None:
+    along = np.arange(0.0, 200.0, 20.0)
+    left = np.where(along < 90, 1.7, -1.7)  # two lines whose registrations are swapped halfway
+    both = find_registered_lines(np.tile(along, 2), np.concatenate([left, -left]), np.repeat([1, 2], len(along)))
+    assert both.contradicted == 2
+    assert not len(both.points(np.array([90.0]))[0])
+    assert len(both.points(np.array([50.0, 150.0]))[0]) == 4
+    mixed = find_registered_lines(np.tile(along, 2), np.repeat([1.7, -1.7], len(along)), np.tile([1, 2], len(along)))
+    assert mixed.contradicted > 4
+    assert (mixed.known_share, len(mixed.start)) == (0.0, 0)
+    off = np.where(along == 100, 3.4, 0.0)
+    one = find_registered_lines(along, off, np.ones(len(along), np.int64))
+    assert one.contradicted == 1
+    assert one.points(np.array([90.0]))[1] == pytest.approx([0.0])

@@ -166,7 +166,7 @@ def drive_cerpms(one: LanePass) -> LanePath:
     files = read_drive_files("drive.zip", upload, declared)
     known = KnownMarkers({n: rows[n] for n in files.numbers if n in rows}, _KEY, {}, last_span=0)
     read = read_packets_of(files, known, declared, received_at=START, observed_at=START)
-    path = estimate_path(lane_markers(read.merged), packet_strengths(read.verification), files.track, declared)
+    path = estimate_path(lane_markers(read), packet_strengths(read.verification), files.track, declared)
     inside = np.isin(installed.number, list(one.own))
     inside &= (installed.chainage_m + low >= one.from_m) & (installed.chainage_m + low <= one.to_m)
     received = np.isin(installed.number[inside], read.merged.number)

@@ -265,7 +265,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
         )
         lane = self._processes.run(
             estimate_lane,
-            lane_markers(read.merged),
+            lane_markers(read),
             packet_strengths(read.verification),
             _left_out(read),
             files.track,

@@ -2892,6 +2892,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
+            line: string | null;
             measure_m: number | null;
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
@@ -2918,6 +2919,8 @@ export interface components {
             heading_rmse_deg?: number | null;
             /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
+            line?: string | null;
             /** @default null */
             measure_m?: number | null;
             /** @default null */
@@ -3288,6 +3291,8 @@ export interface components {
             layout?: ("named" | "pnezd" | "penzd" | "nezd" | "enzd") | null;
             /** @default [] */
             leave_out?: number[];
+            /** @default null */
+            line?: string | null;
             /** @default 0 */
             list_rows?: number;
             /** @default null */
@@ -3945,6 +3950,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
+            line: string | null;
             measure_m: number | null;
             offset_m: number | null;
             position: components["schemas"]["PositionDocument"];
@@ -4715,6 +4721,8 @@ export interface components {
             heading_rmse_deg?: number | null;
             /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
+            /** @default null */
+            line?: string | null;
             /** @default null */
             measure_m?: number | null;
             /** @default null */

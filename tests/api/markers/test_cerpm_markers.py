@@ -51,7 +51,10 @@ def test_another_agency_has_numbers_of_its_own(server: LiveServer, client: httpx
 
 
 def test_what_is_said_can_be_changed(client: httpx.Client, place: Place) -> None:
-    made = client.post("/v1/markers", json=cerpm(place(), side="left", speed_limit={"value": 25, "unit": "mph"})).json()
+    made = client.post(
+        "/v1/markers",
+        json=cerpm(place(), side="left", line="northbound 1 left", speed_limit={"value": 25, "unit": "mph"}),
+    ).json()
     path, new_limit = f"/v1/markers/{made['id']}", {"value": 30, "unit": "km/h"}
     patch = {"speed_limit": new_limit, "side": "right", "radio": {"interval_s": 5.0}, "dev_eui": "00A1B2C3D4E5F607"}
     changed = client.patch(path, json=patch, headers={"If-Match": '"1"'})
@@ -60,6 +63,7 @@ def test_what_is_said_can_be_changed(client: httpx.Client, place: Place) -> None
     assert changed.json()["side"] == "right"
     assert changed.json()["radio"]["interval_s"] == 5.0
     assert changed.json()["dev_eui"] == "00a1b2c3d4e5f607"
+    assert (made["line"], changed.json()["line"]) == ("northbound 1 left", "northbound 1 left")
     assert changed.json()["code"] == made["code"]
     cleared = client.patch(path, json={"speed_limit": None}, headers={"If-Match": '"2"'})
     assert cleared.json()["speed_limit"] is None
@@ -89,6 +93,7 @@ def test_a_plate_has_no_speed_limit_to_change(client: httpx.Client, place: Place
         ({"radio": {"bandwidth_hz": 200_000}}, "radio.bandwidth_hz"),
         ({"radio": {"interval_s": 0}}, "radio.interval_s"),
         ({"dev_eui": "12"}, "dev_eui"),
+        ({"line": ""}, "line"),
         ({"position": {"lon_deg": 500.0, "lat_deg": 2.0}}, "position.lon_deg"),
         ({"position": {"lon_deg": 5.0, "lat_deg": 2.0, "height_m": 9000.0}}, "position.height_m"),
     ],

@@ -150,6 +150,10 @@ def test_the_rows_of_a_proof_are_those_of_a_commit(plan: Plan, committed: dict[i
                 assert getattr(row, name) == getattr(stored, name), (number, name)
         if row.spec is not None:
             chosen = {"codebook_id": None} if "codebook_id" in stored.spec else {}
+            if row.family == "cerpm":  # the line of a committed plan, which has an id
+                plan_id = stored.original["plan"]["id"]  # type: ignore[index]
+                chosen = {"line": stored.spec["line"].removeprefix(f"{plan_id} ")}
+                assert stored.spec["line"] != chosen["line"]
             assert json.loads(json.dumps(row.spec)) == {**stored.spec, **chosen}
 
 
@@ -169,6 +173,8 @@ def test_a_server_estimates_the_path_of_the_proof(
     ((_files, upload),), ((_given, path),) = packs, paths
     assert path.refusal is None
     survey.store(client, committed)
+    surveyed = client.get(f"/v1/markers/{wanted['marker_ids'][0]}").json()  # type: ignore[index]
+    assert surveyed["line"] in {row.spec["line"] for row in committed.values() if row.family == "cerpm"}
     monkeypatch.undo()
     decoded = decode(client, upload.read(), "drive.zip", {"packets": {}})
     lane = decoded["lane"]

@@ -84,6 +84,9 @@ def test_a_path_is_estimated_from_the_uploaded_files_and_the_registered_rows(
     for number, lon, lat, side in zip(markers.number, markers.lon_deg, markers.lat_deg, markers.side, strict=True):
         assert (lon, lat) == pytest.approx((rows[number].lon_deg, rows[number].lat_deg), abs=1e-9)
         assert side == recordings.side_of(rows[number])
+    lines = {(line, recordings.line_of(rows[n])) for n, line in zip(markers.number, markers.line, strict=True)}
+    assert len(lines) == len({line for line, _ in lines}) == len({name for _, name in lines}) == 3
+    assert {name for _, name in lines} == {(None, "1 left"), (None, "1 right"), (None, "2 right")}
 
 
 @pytest.mark.parametrize("name", ["1", "2"])
