@@ -153,6 +153,8 @@ URGENCY: Mapping[str, float] = {
     "wrong-way": 0.9,
     "cloned": 0.9,
     "moved": 0.8,
+    "shifted": 0.8,
+    "turned": 0.8,
     "missing": 0.6,
     "unregistered": 0.5,
     "fading": 0.4,

@@ -32,14 +32,14 @@ from app.values import JsonObject
 
 ITEM_STATUSES = ("open", "approved", "rejected")
 
-# the tests of a marker, of a code that is not registered, or a vehicle's own errors: app/health/states.py
+# tests of a marker, a code that is not registered, a stretch, or a vehicle's own errors: app/health/states.py
 marker_health = sa.Table(
     "marker_health",
     metadata,
     sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
-    sa.Column("subject", sa.String(200), primary_key=True),  # a marker's id, code:..., or vehicle:...
+    sa.Column("subject", sa.String(200), primary_key=True),  # a marker's id, code:..., stretch:..., vehicle:...
     sa.Column("marker_id", ID, sa.ForeignKey("markers.id")),
-    sa.Column("lon_deg", sa.Double),  # of a code that is not registered
+    sa.Column("lon_deg", sa.Double),  # of a code that is not registered, or of a stretch
     sa.Column("lat_deg", sa.Double),
     sa.Column("passes", sa.BigInteger, nullable=False),
     sa.Column("reads", sa.BigInteger, nullable=False),
@@ -113,7 +113,7 @@ _H, _U = marker_health.c, unregistered_readings.c
 
 
 class HealthRow(NamedTuple):
-    """Tests of a marker, of a code that is not registered, or a vehicle's own errors."""
+    """Tests of a marker, of a code that is not registered, of a stretch, or a vehicle's own errors."""
 
     subject: str
     marker_id: str | None
@@ -333,7 +333,10 @@ class ItemFilter:
 _ITEMS = select_rows(ItemRow, maintenance_items)
 ITEM_FIELDS = (
     Field(
-        "what", "string", _M.what, "missing, moved, cloned, wrong-way, fading, unregistered, wrong-way-driver, reported"
+        "what",
+        "string",
+        _M.what,
+        "missing, moved, cloned, wrong-way, fading, unregistered, shifted, turned, wrong-way-driver, reported",
     ),
     Field("status", "string", _M.status, "open, approved or rejected"),
     Field("outcome", "string", _M.outcome, "What was approved: suspect, retired, resurvey or none"),

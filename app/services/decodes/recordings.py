@@ -47,6 +47,7 @@ from app.services.health.traces import (
     packet_evidence,
     tag_evidence,
     with_evidence,
+    with_stretches,
 )
 from app.services.markers.codebooks import MAX_BOOKS_SEARCHED
 from app.services.ports import DecoderProcesses, Pending
@@ -317,7 +318,9 @@ class PacketHandler(UploadHandler[DriveSignal]):
         }
         directions = lane_directions(list(received.values()), signal.files.track)
         missed = missed_cerpms(connection, upload.agency_id, read, signal.files, at)
-        return [*with_evidence(rows, evidence, directions), *missed]
+        rows = with_evidence(rows, evidence, directions)
+        rows = with_stretches(rows, list(received.values()), signal.result.lane, signal.files.track)
+        return [*rows, *missed]
 
 
 def _holder(upload: Upload) -> str:

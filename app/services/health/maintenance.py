@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal, NotRequired
+from typing import Literal, NamedTuple, NotRequired
 
 import orjson
 import sqlalchemy as sa
@@ -17,7 +17,7 @@ from app.errors import Conflict
 from app.families.documents import MarkerDocument
 from app.families.surveys import RETIRED
 from app.formats.text import TableWriter
-from app.health import MarkerState, Verdict
+from app.health import Displacement, MarkerState, StretchState, Verdict
 from app.health.marker_tests import item_priority
 from app.health.states import RULES, TESTED, Fault
 from app.markers.reading import MarkerRow
@@ -40,7 +40,10 @@ from app.values import JsonObject
 
 ItemStatus = Literal["open", "approved", "rejected"]
 Outcome = Literal["suspect", "retired", "resurvey", "none"]
-What = Literal["missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "wrong-way-driver", "reported"]
+What = Literal[
+    "missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "shifted", "turned", "wrong-way-driver",
+    "reported",
+]  # fmt: skip
 
 
 class UploadLink(TypedDict):
@@ -65,6 +68,11 @@ class ItemEvidence(TypedDict):
     The likelihood ratio has passed the limit, both as natural logarithms. A healthy marker reaches this ratio with
     `false_alarm_probability` at most. `offset_m` is the estimated displacement of a marker that has moved;
     `elsewhere_lon_deg` and `elsewhere_lat_deg` are where a vehicle was that read the marker far from its place.
+
+    The offset of a stretch is the shift of all its markers, with its standard deviations: of the shift in its own
+    direction, to the east and to the north. The last two are large in a direction that drives do not show, as along a
+    straight road. `turn_deg` is the turn of the markers about the item's position, anticlockwise; `directions` counts
+    the directions of travel that were driven, 1 or 2; `check` says in plain words what to check.
     """
 
     limit: NotRequired[float]
@@ -73,6 +81,13 @@ class ItemEvidence(TypedDict):
     offset_m: NotRequired[float]
     offset_east_m: NotRequired[float]
     offset_north_m: NotRequired[float]
+    offset_sigma_m: NotRequired[float]
+    offset_sigma_east_m: NotRequired[float]
+    offset_sigma_north_m: NotRequired[float]
+    turn_deg: NotRequired[float]
+    turn_sigma_deg: NotRequired[float]
+    directions: NotRequired[int]
+    check: NotRequired[str]
     elsewhere_lon_deg: NotRequired[float]
     elsewhere_lat_deg: NotRequired[float]
     uploads: list[UploadLink]
@@ -170,19 +185,32 @@ MAX_REPORTS = 20
 WRONG_WAY_EVENT = "maintenance.wrong-way-driver"
 MAX_UPLOADS = 5
 """Uploads that an item links to. What a person looks at."""
+STRETCH_FAMILY = "cerpm"
+"""Of the markers whose stretches are tested: their path is compared with the tracks of vehicles."""
 _NOT_ON_ROAD = frozenset({"planned", RETIRED})
 _SHOWN_DIGITS = 3
 _WITH_PLOT = frozenset({"trace", "packets"})
 
 
+class Stretch(NamedTuple):
+    """A stretch of road whose CERPMs are tested together."""
+
+    road: str | None
+    measure_m: float | None  # [m] where it begins
+    # `lon_deg`, `lat_deg`: [deg] its middle
+    lon_deg: float
+    lat_deg: float
+
+
 @dataclass(frozen=True, slots=True)
 class Suspicion:
-    """A verdict about a marker, or about a code that is not registered."""
+    """A verdict about a marker, about a code that is not registered, or about a stretch."""
 
     subject: str
     verdict: Verdict
     month_passes: float
     reading: NewUnregistered | None = None
+    stretch: Stretch | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,9 +242,11 @@ def _open_or_update(
     connection: sa.Connection, agency_id: str, upload: ItemUpload, suspicion: Suspicion, now: datetime
 ) -> None:
     verdict, what = suspicion.verdict, str(suspicion.verdict.fault)
-    marker = get_marker(connection, agency_id, suspicion.subject) if suspicion.reading is None else None
+    other = suspicion.reading or suspicion.stretch
+    marker = get_marker(connection, agency_id, suspicion.subject) if other is None else None
     if marker is not None and marker.status in _NOT_ON_ROAD:
         return
+    known = health.find_open(connection, agency_id, suspicion.subject, what)
     figures = {
         "priority": item_priority(
             what, acted_on=_is_acted_on(marker), ratio=verdict.ratio, limit=verdict.limit,
@@ -227,13 +257,12 @@ def _open_or_update(
         "passes": verdict.passes,
         "first_at": datetime.fromtimestamp(verdict.since_s, UTC),
         "last_at": upload.at,
-        "evidence": _evidence(connection, agency_id, suspicion, upload),
+        "evidence": _evidence(connection, agency_id, suspicion, upload, known),
     }  # fmt: skip
-    known = health.find_open(connection, agency_id, suspicion.subject, what)
     if known is not None:
         health.change_item(connection, agency_id, known, {**figures, "updated_at": now})
         return
-    row = _new_item(suspicion.subject, upload.decode_id, what, marker, suspicion.reading, figures, now)
+    row = _new_item(suspicion.subject, upload.decode_id, what, marker, other, figures, now)
     health.add_item(connection, agency_id, row)
     add_event(connection, agency_id, OPENED, subject_id=row.id, at=now, detail=_event_detail(row))
 
@@ -291,23 +320,25 @@ def open_reported_item(
 
 
 def _new_item(
-    subject: str, decode_id: str | None, what: str, marker: MarkerRow | None, reading: NewUnregistered | None,
-    figures: JsonObject, now: datetime,
+    subject: str, decode_id: str | None, what: str, marker: MarkerRow | None,
+    other: NewUnregistered | Stretch | None, figures: JsonObject, now: datetime,
 ) -> ItemRow:  # fmt: skip
-    place = marker if marker is not None else reading
+    place = marker if marker is not None else other
     assert place is not None
+    on_road = place if isinstance(place, MarkerRow | Stretch) else None
+    code = marker.digits if marker is not None else other.code if isinstance(other, NewUnregistered) else None
     return ItemRow(
         id=new_id(now),
         subject=subject,
         marker_id=marker.id if marker is not None else None,
         decode_id=decode_id,
-        family=place.family,
-        code=marker.digits if marker is not None else reading.code if reading is not None else None,
+        family=STRETCH_FAMILY if isinstance(place, Stretch) else place.family,
+        code=code,
         what=what,
         status="open",
         outcome=None,
-        road=marker.road if marker is not None else None,
-        measure_m=marker.measure_m if marker is not None else None,
+        road=on_road.road if on_road is not None else None,
+        measure_m=on_road.measure_m if on_road is not None else None,
         lon_deg=place.lon_deg,
         lat_deg=place.lat_deg,
         height_m=marker.height_m if marker is not None else None,
@@ -329,10 +360,14 @@ def _is_acted_on(marker: MarkerRow | None) -> bool:
     return bool(spec.get("meaning") or spec.get("speed_limit"))
 
 
-def _evidence(connection: sa.Connection, agency_id: str, suspicion: Suspicion, upload: ItemUpload) -> dict[str, object]:
+def _evidence(
+    connection: sa.Connection, agency_id: str, suspicion: Suspicion, upload: ItemUpload, known: ItemRow | None
+) -> dict[str, object]:
     verdict = suspicion.verdict
     uploads = [_upload(upload.decode_id, 0, upload.at, has_frames=upload.has_frames)]
-    if suspicion.reading is None:
+    if suspicion.stretch is not None and known is not None:
+        uploads = [*uploads, *known.evidence["uploads"]][:MAX_UPLOADS]
+    elif suspicion.stretch is None and suspicion.reading is None:
         rows = store.list_evidence(connection, agency_id, suspicion.subject, limit=4 * MAX_UPLOADS)
         by_decode = {row.decode_id: row for row in reversed(rows)}
         uploads = [
@@ -350,9 +385,39 @@ def _evidence(connection: sa.Connection, agency_id: str, suspicion: Suspicion, u
         east_m, north_m = verdict.offset_m
         found["offset_east_m"], found["offset_north_m"] = round(east_m, 3), round(north_m, 3)
         found["offset_m"] = round(math.hypot(east_m, north_m), 3)
+    if verdict.displacement is not None:
+        found |= _displacement(verdict.displacement, is_turned=verdict.fault is Fault.TURNED)
     if verdict.elsewhere is not None:
         found["elsewhere_lon_deg"], found["elsewhere_lat_deg"] = (round(value, 7) for value in verdict.elsewhere)
     return found
+
+
+def _displacement(found: Displacement, *, is_turned: bool) -> dict[str, object]:
+    """Figures of a displaced stretch, and what to check."""
+    turned = f", and turned by {found.turn_deg:+.3f} degrees (± {found.turn_sigma_deg:.3f})" if is_turned else ""
+    shift_m = math.hypot(found.east_m, found.north_m)
+    check = (
+        f"All CERPMs of the stretch are displaced against the lane as vehicles drive it: by {shift_m:.2f} m across the "
+        f"road (± {found.sigma_m:.2f} m), {found.east_m:+.2f} m east and {found.north_m:+.2f} m north{turned}. "
+        "Check the datum, realization and epoch that were declared for their survey, the control points of the survey, "
+        "and the positions that were programmed into the markers."
+    )
+    if found.directions == 1:
+        check += (
+            " Only one direction of travel was driven: up to 0.2 m of the shift may be a habit that its drivers have "
+            "in common. Drives in the other direction show which it is."
+        )
+    shown = {
+        "offset_sigma_m": found.sigma_m, "offset_sigma_east_m": found.east_sigma_m,
+        "offset_sigma_north_m": found.north_sigma_m,
+    }  # fmt: skip
+    return {
+        **{name: round(value, _SHOWN_DIGITS) for name, value in shown.items()},
+        "turn_deg": round(found.turn_deg, 4),
+        "turn_sigma_deg": round(found.turn_sigma_deg, 4),
+        "directions": found.directions,
+        "check": check,
+    }
 
 
 def _upload(decode_id: str, frame: int, at: datetime, *, has_frames: bool) -> dict[str, object]:
@@ -537,9 +602,14 @@ def _reset_test(connection: sa.Connection, agency_id: str, row: ItemRow, now: da
     stored = store.find_health(connection, agency_id, [row.subject]).get(row.subject)
     if fault is None or stored is None:
         return
-    state = MarkerState.from_document(stored.state)
-    state.reset(fault)
-    document = state.document()
+    if fault in (Fault.SHIFTED, Fault.TURNED):
+        stretch = StretchState.from_document(stored.state)
+        stretch.reset()
+        document = stretch.document()
+    else:
+        state = MarkerState.from_document(stored.state)
+        state.reset(fault)
+        document = state.document()
     changed = stored._replace(state=document, ratios=document["ratios"], updated_at=now)
     store.store_health(connection, agency_id, [changed])
 

@@ -19,15 +19,18 @@ from app.health import (
     JudgedDrive,
     MarkerState,
     Pass,
+    StretchDrive,
+    StretchState,
     VehicleState,
     judge_drive,
     update_marker,
+    update_stretch,
     update_unregistered,
 )
 from app.registry import health as store
 from app.registry.decodes import NewObservation
 from app.registry.health import HealthRow, NewUnregistered
-from app.services.health.maintenance import ItemUpload, Suspicion, open_items
+from app.services.health.maintenance import ItemUpload, Stretch, Suspicion, open_items
 from app.values import JsonObject
 
 # === Evidence of an observation on its marker's health: to the stored detail, and back to a pass.
@@ -36,6 +39,8 @@ from app.values import JsonObject
 EVIDENCE = "evidence"
 """Member of an observation's detail."""
 MISSED = "missed"
+STRETCH = "stretch"
+"""Member of the detail of one marker's observation: what the drive shows of the stretch of road on which it is."""
 
 
 class EvidenceDocument(TypedDict, total=False):
@@ -163,13 +168,15 @@ def record_drive(
         False where the states are computed again: people have decided on the items.
     """
     passes = passes_of(drive.observations)
-    if not passes and not drive.unregistered:
+    driven = {row.detail[STRETCH]["subject"]: row for row in drive.observations if row.detail and STRETCH in row.detail}
+    if not passes and not drive.unregistered and not driven:
         return
     vehicle = _short(agency_id, drive.vehicle)
     own = f"vehicle:{vehicle}:{drive.sensor}"
     stored = store.find_health(connection, agency_id, [own, *(one.marker_id for one, _row in passes)])
     record = VehicleState(**stored[own].state) if own in stored else VehicleState()
-    at = passes[0][1].at if passes else drive.unregistered[0].at
+    times = [row.at for _one, row in passes] + [reading.at for reading in drive.unregistered]
+    at = [*times, *(row.at for row in driven.values())][0]
     judged = judge_drive([one for one, _row in passes], record, at.timestamp())
     rows = [_vehicle_row(own, record, at, now)]
     suspicions = []
@@ -179,11 +186,12 @@ def record_drive(
         rows.append(_marker_row(one.marker_id, state, row, now))
         suspicions += [Suspicion(one.marker_id, verdict, state.month_passes) for verdict in verdicts]
     unknown_rows, unknown = _add_unregistered(connection, agency_id, drive, vehicle, now)
-    store.store_health(connection, agency_id, [*rows, *unknown_rows])
+    stretch_rows, displaced = _add_stretches(connection, agency_id, driven, vehicle, now)
+    store.store_health(connection, agency_id, [*rows, *unknown_rows, *stretch_rows])
     if opens_items:
         wrong_way = _wrong_way_marker(judged, passes, {row.subject: row for row in rows})
         upload = ItemUpload(drive.decode_id, drive.sensor == CAMERA, vehicle, at)
-        open_items(connection, agency_id, upload, [*suspicions, *unknown], wrong_way, now)
+        open_items(connection, agency_id, upload, [*suspicions, *unknown, *displaced], wrong_way, now)
 
 
 def recompute_health(connection: sa.Connection, agency_id: str, now: datetime) -> int:
@@ -239,6 +247,36 @@ def _marker_row(marker_id: str, state: MarkerState, row: NewObservation, now: da
 
 def _vehicle_row(subject: str, record: VehicleState, at: datetime, now: datetime) -> HealthRow:
     return HealthRow(subject, None, None, None, 0, 0, None, at, {}, None, record.document(), now)
+
+
+def _add_stretches(
+    connection: sa.Connection, agency_id: str, driven: Mapping[str, NewObservation], vehicle: str, now: datetime
+) -> tuple[list[HealthRow], list[Suspicion]]:
+    """Add a drive to the tests of the stretches that it shows."""
+    stored = store.find_health(connection, agency_id, list(driven)) if driven else {}
+    rows, found = [], []
+    for subject, row in driven.items():
+        document = row.detail[STRETCH]
+        one = StretchDrive.from_document(document["drive"])
+        known = stored.get(subject)
+        state = (
+            StretchState(one.lon_deg, one.lat_deg, one.heading_deg)
+            if known is None
+            else StretchState.from_document(known.state)
+        )
+        verdict = update_stretch(state, one, vehicle, row.at.timestamp())
+        written = state.document()
+        last_at = datetime.fromtimestamp(state.last_s, UTC)
+        rows.append(
+            HealthRow(
+                subject, None, state.lon_deg, state.lat_deg, state.passes, 0, None, last_at, written["ratios"], None,
+                written, now,
+            )
+        )  # fmt: skip
+        if verdict is not None:
+            place = Stretch(document["road"], document["measure_m"], state.lon_deg, state.lat_deg)
+            found.append(Suspicion(subject, verdict, state.month_passes, stretch=place))
+    return rows, found
 
 
 def _add_unregistered(

@@ -4257,6 +4257,8 @@ export interface components {
             fy_px: number;
         };
         ItemEvidence: {
+            check?: string;
+            directions?: number;
             elsewhere_lat_deg?: number;
             elsewhere_lon_deg?: number;
             false_alarm_probability?: number;
@@ -4265,7 +4267,12 @@ export interface components {
             offset_east_m?: number;
             offset_m?: number;
             offset_north_m?: number;
+            offset_sigma_east_m?: number;
+            offset_sigma_m?: number;
+            offset_sigma_north_m?: number;
             reports?: components["schemas"]["ReportLink"][];
+            turn_deg?: number;
+            turn_sigma_deg?: number;
             uploads: components["schemas"]["UploadLink"][];
         };
         ItemProblem: {
@@ -4695,7 +4702,7 @@ export interface components {
             vehicles: number;
             version: number;
             /** @enum {string} */
-            what: "missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "wrong-way-driver" | "reported";
+            what: "missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "shifted" | "turned" | "wrong-way-driver" | "reported";
         };
         MaintenancePage: {
             items: components["schemas"]["MaintenanceItem"][];
@@ -9709,7 +9716,7 @@ export interface operations {
                 min_priority?: number | null;
                 road?: string | null;
                 status?: ("open" | "approved" | "rejected") | null;
-                what?: ("missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "wrong-way-driver" | "reported") | null;
+                what?: ("missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "shifted" | "turned" | "wrong-way-driver" | "reported") | null;
             };
             header?: never;
             path?: never;
@@ -9737,7 +9744,7 @@ export interface operations {
                 min_priority?: number | null;
                 road?: string | null;
                 status?: ("open" | "approved" | "rejected") | null;
-                what?: ("missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "wrong-way-driver" | "reported") | null;
+                what?: ("missing" | "moved" | "cloned" | "wrong-way" | "fading" | "unregistered" | "shifted" | "turned" | "wrong-way-driver" | "reported") | null;
             };
             header?: never;
             path: {

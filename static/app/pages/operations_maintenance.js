@@ -18,7 +18,7 @@ import { may } from "../session.js";
 import { t, textOr } from "../texts/index.js";
 
 const BASE = "/operations/maintenance";
-const FAULTS = /** @type {const} */ (["missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "wrong-way-driver", "reported"]);
+const FAULTS = /** @type {const} */ (["missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "shifted", "turned", "wrong-way-driver", "reported"]);
 const OUTCOMES = /** @type {const} */ (["suspect", "resurvey", "retired", "none"]);
 const URGENT = 0.6;
 const SOON = 0.3;
@@ -91,7 +91,10 @@ function One({ id, onChanged }) {
           [t("field.last_at"), time(item.last_at)],
           [t("maintenance.evidence"), item.passes > 0 && t("maintenance.evidence_text", { passes: number(item.passes), vehicles: number(item.vehicles) })],
           [t("maintenance.false_alarm"), item.evidence.false_alarm_probability && t("maintenance.false_alarm_text", { one: number(1 / item.evidence.false_alarm_probability) })],
-          [t("maintenance.offset"), item.evidence.offset_m && number(item.evidence.offset_m, 2, "m")],
+          [t("maintenance.offset"), item.evidence.offset_m && `${number(item.evidence.offset_m, 2, "m")}${item.evidence.offset_sigma_m ? ` ± ${number(item.evidence.offset_sigma_m, 2, "m")}` : ""}`],
+          [t("maintenance.offset_parts"), item.evidence.offset_sigma_m && t("maintenance.offset_parts_text", { east: number(item.evidence.offset_east_m, 2, "m"), north: number(item.evidence.offset_north_m, 2, "m") })],
+          [t("maintenance.turn"), item.what === "turned" && `${number(item.evidence.turn_deg, 3)}° ± ${number(item.evidence.turn_sigma_deg, 3)}°`],
+          [t("maintenance.directions"), item.evidence.directions && t(item.evidence.directions === 1 ? "maintenance.one_direction" : "maintenance.both_directions")],
           [t("field.status"), textOr(`option.${item.status}`, item.status)],
           [t("maintenance.outcome"), item.outcome && textOr(`item_outcome.${item.outcome}`, item.outcome)],
           [t("field.note"), item.note],

@@ -15,19 +15,21 @@ import httpx
 import numpy as np
 import pytest
 
-from app.demo.cerpms import BuiltLane, build_lane
+from app.demo.cerpms import BuiltLane, build_lane, load_lane, register_lane
 from app.encoders.cerpm import encode_message
 from app.geodesy import wgs84_from_enu
 from app.markers.magnet import InformationTag, parse_tag
+from app.planning.cerpm_placement import place_markers
 from app.services.access.access import Scope
 from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road
 from app.simulation.radio.attacks import move_claim
 from app.simulation.radio.drive import Driver, drive_lane, drive_past, write_packets, write_poses
-from app.simulation.radio.lanes import InstalledMarkers, lane_between
+from app.simulation.radio.lanes import InstalledMarkers, install_markers, lane_between
 from app.simulation.radio.link import Radio
 from tests.api.decodes.conftest import post_frame
+from tests.api.decodes.test_health import _check_recomputed
 from tests.conftest import LiveServer
 
 pytestmark = pytest.mark.slow
@@ -43,6 +45,7 @@ SPEED_M_S = 20.0
 Origin = tuple[float, float, float]
 ORIGIN, ELSEWHERE = (31.0, 47.0, 100.0), (33.0, 47.0, 100.0)
 BEGAN = datetime(2026, 6, 1, 8, tzinfo=UTC)
+NORTH_M, FEW = 1.2, 12
 MANY = 20
 """Vehicles that may be needed for a tag or a CERPM that is gone."""
 
@@ -178,9 +181,12 @@ def test_a_driver_on_the_wrong_way_is_an_item_and_accuses_no_tag(server: LiveSer
 # --- CERPMs -----------------------------------------------------------------------------------------------------------
 
 
-def _log(built: BuiltLane, installed: InstalledMarkers, hour: int, *, wrong_way: bool = False) -> bytes:
+def _log(
+    built: BuiltLane, installed: InstalledMarkers, hour: int, *, wrong_way: bool = False, seed: int | None = None
+) -> bytes:
     """What a vehicle hears: every hour markers go on counting their messages. Of two with one number one is ahead."""
-    rng, lane, start_s = np.random.default_rng(hour % 2), built.lane, BEGAN.timestamp() + 3600.0 * hour
+    rng = np.random.default_rng(hour % 2 if seed is None else seed)
+    lane, start_s = built.lane, BEGAN.timestamp() + 3600.0 * hour
     first_sequence = np.full(len(installed), 3600 * hour)
     first_sequence[-1] += 5
     against = lane_between(lane.right_m[::-1], lane.left_m[::-1], lane.origin)
@@ -224,3 +230,38 @@ def test_cerpms_with_faults_are_found_by_the_logs_of_several_vehicles(server: Li
         _post(owner, _log(built, built.installed, hour, wrong_way=True), {"packets": {}})
         drivers = owner.get("/v1/maintenance", params={"what": "wrong-way-driver"}).json()["items"]
         assert [driver["family"] for driver in drivers] == ["cerpm"]
+
+
+def test_a_survey_in_another_datum_is_found_by_the_logs_of_several_vehicles(server: LiveServer) -> None:
+    """All markers are registered and programmed 1.2 m north of where they are."""
+    name = "health of stretches"
+    with server.agency(name, Scope.ADMIN) as owner:
+        rng, lane = np.random.default_rng(1902), load_lane()
+        installed = install_markers(lane, place_markers(lane.left_m, lane.right_m), rng)
+        built = register_lane(owner, lane, replace(installed, lat_deg=installed.lat_deg + NORTH_M / 111_200.0))
+        for hour in range(3):
+            _post(owner, _log(built, built.installed, hour, seed=hour), {"packets": {}})
+        assert _found(owner) == set()  # however often one vehicle passes
+        hour = 3
+        while not owner.get("/v1/maintenance").json()["items"]:
+            assert hour < FEW, "not found"
+            with server.agency(name, Scope.VEHICLE) as vehicle:
+                _post(vehicle, _log(built, built.installed, hour, seed=hour), {"packets": {}})
+            hour += 1
+        items = owner.get("/v1/maintenance").json()["items"]
+        assert {(item["what"], item["family"], item["marker_id"]) for item in items} == {("shifted", "cerpm", None)}
+        assert all(item["vehicles"] >= 3 for item in items)
+        # each stretch shows the part of the shift that is across it
+        evidence = max((item["evidence"] for item in items), key=lambda one: one["offset_north_m"])
+        assert evidence["offset_north_m"] == pytest.approx(NORTH_M, abs=0.4)
+        assert evidence["offset_sigma_m"] < 0.3
+        assert evidence["directions"] == 1
+        assert "datum" in evidence["check"]
+        _check_recomputed(server, owner)
+        answer = owner.post(f"/v1/maintenance/{items[0]['id']}/approve", json={"outcome": "none"})
+        assert answer.status_code == 200, answer.text
+        with server.agency(name, Scope.VEHICLE) as vehicle:
+            _post(vehicle, _log(built, built.installed, hour, seed=hour), {"packets": {}})
+        again = owner.get("/v1/maintenance", params={"status": "open"}).json()["items"]
+        assert items[0]["id"] not in {item["id"] for item in again}  # the test begins again
+        assert len(again) == len(items) - 1

@@ -15,7 +15,7 @@ from app.main import create_app
 from app.registry.webhooks import list_events
 from app.services.access.access import Scope
 from app.settings import Settings
-from tests.api.health.items import add_test_item
+from tests.api.health.items import add_test_item, drive_shifted_stretch
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 from tests.jobs import standin
 
@@ -183,3 +183,30 @@ def test_a_marker_without_passes_has_no_ratios(owner: httpx.Client) -> None:
     assert (health["passes"], health["ratios"], health["last_at"]) == (0, {}, None)
     assert health["limits"]["missing"] == pytest.approx(13.122, abs=0.001)
     assert health["limits"]["moved"] == pytest.approx(8.517, abs=0.001)
+
+
+def test_a_stretch_whose_markers_are_all_shifted_is_an_item_without_a_marker(
+    server: LiveServer, owner: httpx.Client
+) -> None:
+    def drive(vehicles: range) -> list[dict[str, Any]]:
+        with server.app.state.database.write() as connection:
+            for number in vehicles:
+                drive_shifted_stretch(connection, _agency_id(server, owner), f"v{number}", north_m=1.0)
+        items: list[dict[str, Any]] = owner.get("/v1/maintenance?road=S7&status=open").json()["items"]
+        return items
+
+    assert drive(range(2)) == []
+    (item,) = drive(range(2, 6))
+    assert (item["what"], item["marker_id"], item["family"]) == ("shifted", None, "cerpm")
+    assert (item["road"], item["measure_m"], item["vehicles"]) == ("S7", 1500.0, 6)
+    evidence = item["evidence"]
+    assert evidence["offset_north_m"] == pytest.approx(1.0, abs=0.2)
+    assert evidence["offset_sigma_north_m"] < 0.3 < 5.0 < evidence["offset_sigma_east_m"]
+    assert "Check the datum" in evidence["check"]
+    assert "Only one direction" in evidence["check"]
+    assert 1 < len(evidence["uploads"]) <= 5
+    path = f"/v1/maintenance/{item['id']}/approve"
+    assert owner.post(path, json={"outcome": "suspect"}).status_code == 409
+    assert owner.post(path, json={"outcome": "none"}).status_code == 200
+    assert drive(range(6, 8)) == []  # the test starts again
+    assert len(drive(range(8, 12))) == 1
