@@ -54,6 +54,7 @@ _ANOTHER_M = 1.3  # [m] centres further apart are of two lanes; half of the narr
 _TIE = 14.0  # squared sigmas; odds of 1 to 1,100
 _ENDS, _LONG = 2, 8  # stations at each end of longer courses, where few markers are around the vehicle
 _BOTH_LANES, _BOTH_SHARE = 3, 0.5  # stations before and after a line is crossed, and their share with both lanes
+_MAX_CHANGE_TURN = 0.5  # [rad] of the track while it changes lane; beyond, an inaccurate receiver shows none
 _CROSSED_M = 60.0  # [m] between the end of a lane on one side and the start of one on the other
 _TRACE_M = 1.1  # [m] of a lane's centre from where it was expected
 _NEARER_COST = 0.05  # [1/m] squared sigmas at each station, so that the next lane comes before the one after it
@@ -206,7 +207,7 @@ def choose_driven_lane(
     last = model.trace(_last_lane_m(course)) if course.lane.any() else course
     side = _sides_of(last, station_m, left_m)
     beside = _lanes_beside(model, last, station_m, left_m, named)
-    if _is_crossed(beside):
+    if _is_crossed(beside) or (not model.precise and _turn_while_changing(course, drive) > _MAX_CHANGE_TURN):
         others.append(course)
     return DrivenLane(side, course, tuple(others), last, tuple(beside), lines.contradicted)
 
@@ -632,6 +633,16 @@ def _lanes_beside(
             side = np.where(inside, side, UNKNOWN)
             found.append(CourseBeside(sign * position, _direction(side, named), course, side))
     return found
+
+
+def _turn_while_changing(course: LaneCourse, drive: DrivenLine) -> float:
+    """How far the track turns during a change of lane, at most; 0 without one. [rad]"""
+    _, tangent = drive.line.points_at(course.station_m)
+    yaw = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], course.changing.astype(np.int8), [0]])))
+    return max(
+        (float(np.ptp(yaw[max(a - 1, 0) : b + 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)), default=0.0
+    )
 
 
 def _is_crossed(beside: list[CourseBeside]) -> bool:

@@ -502,6 +502,7 @@ _SPANS_M = (24.0, 48.0)  # [m] within which a path moves across; two and four sp
 _AROUND_M = 60.0  # [m] before and after, where constant errors are learnt
 _MIN_AROUND = 8  # steps of the track there
 _MIN_ASIDE_M, _ASIDE_SIGMAS, _CLEAR_SIGMAS = 0.5, 5.0, 3.0  # [m, 1, 1] that is reported; where the path clearly turns
+_BUMP_SHARE = 1.08  # of the vehicle's turn, which places beside each other in a bend may differ by
 _BUMP_PER_M, _CLEAR_BUMP = 0.02, 0.03  # [rad/m, rad] by which the path turns aside and back more than the vehicle
 _SLOW_DRIFT = 0.2  # share of a receiver's accuracy by which its error changes in between
 _HEADING_SD = 0.03  # [rad] of a step's heading
@@ -543,7 +544,7 @@ def find_departure(lane: Lane, track: PoseTrack, doubtful_m: Floats) -> Departur
         near, _ = scipy.spatial.cKDTree(doubtful_m).query(lane.position_enu_m[steps.at])
         doubtful = np.asarray(near) < _DOUBTFUL_REACH_M
     shortest = max(round(_SPANS_M[0] / steps.length_m / 2), 1)
-    turns_aside = _bump(steps.path_yaw, shortest) - _bump(steps.track_yaw, shortest)
+    turns_aside = _bump(steps.path_yaw, shortest) - _BUMP_SHARE * _bump(steps.track_yaw, shortest)
     worst: tuple[float, Departure | None] = (1.0, None)
     for span_m in _SPANS_M:
         half = max(round(span_m / steps.length_m / 2), 1)
