@@ -567,13 +567,14 @@ def _side_by_side(outer: Bools, rows: Ints, observations: LaneObservations) -> b
 
 def _split_in_two(ranked_m: Floats) -> tuple[float, float, float]:
     """The two groups of ranked values that spread least: first value of the upper one, distance, and spread. [m]"""
-    best = (0.0, 0.0, np.inf)
-    for k in range(_MIN_ROW, len(ranked_m) - _MIN_ROW + 1):
-        low, high = ranked_m[:k], ranked_m[k:]
-        spread = float(np.sqrt((k * low.var() + (len(ranked_m) - k) * high.var()) / len(ranked_m)))
-        if spread < best[2]:
-            best = (float(high[0]), float(high.mean() - low.mean()), spread)
-    return best
+    values = ranked_m - ranked_m.mean()
+    low = np.arange(_MIN_ROW, len(values) - _MIN_ROW + 1)  # values of the lower group
+    high = len(values) - low
+    total, squares = np.cumsum(values), np.cumsum(values**2)
+    low_mean, high_mean = total[low - 1] / low, (total[-1] - total[low - 1]) / high
+    spread = np.sqrt(np.maximum(squares[-1] - low * low_mean**2 - high * high_mean**2, 0.0) / len(values))
+    k = int(np.argmin(spread))
+    return float(ranked_m[low[k]]), float(high_mean[k] - low_mean[k]), float(spread[k])
 
 
 def _fit_by_splines(observations: LaneObservations, taken: Bools, line: SmoothLine | None, notes: Notes) -> Lane:

@@ -368,6 +368,8 @@ def _largest_step_m(time_s: Floats, fixes_m: Floats) -> float:
     few = _STEP_FIXES
     if len(time_s) < 4 * few or np.median(np.diff(time_s)) > _MAX_STEP_INTERVAL_S:
         return 0.0
+    if np.abs(fixes_m[2:] - 2 * fixes_m[1:-1] + fixes_m[:-2]).max() < _MIN_STEP_M / 2:
+        return 0.0  # as of nearly all accurate receivers
     windows = np.lib.stride_tricks.sliding_window_view(fixes_m, 2 * few, axis=0)
     times = np.lib.stride_tricks.sliding_window_view(time_s, 2 * few)
     speed = np.median(np.diff(windows, axis=2) / np.diff(times)[:, None], axis=2)
