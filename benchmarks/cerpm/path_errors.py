@@ -28,6 +28,7 @@ class Tally:
     confidence: list[Floats] = field(default_factory=list)
     right: list[Floats] = field(default_factory=list)
     within_two_sigma: list[Floats] = field(default_factory=list)
+    sigma_m: list[Floats] = field(default_factory=list)
     covered: int = 0
     places: int = 0
     runs: int = 0
@@ -35,7 +36,7 @@ class Tally:
 
     def add(self, other: Tally) -> None:
         """Add the runs of another tally."""
-        for name in ("off_m", "curvature_per_m", "confidence", "right", "within_two_sigma"):
+        for name in ("off_m", "curvature_per_m", "confidence", "right", "within_two_sigma", "sigma_m"):
             getattr(self, name).extend(getattr(other, name))
         for name in ("covered", "places", "runs", "refused"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
@@ -44,6 +45,14 @@ class Tally:
     def rms_m(self) -> float:
         """Of the distance from the true centre line to the path. [m]"""
         return _rms(self.off_m)
+
+    @property
+    def bound_m(self) -> float:
+        """Standard deviation that the markers and the smoothness of roads leave at best, RMS. [m]
+
+        It is the Cramér-Rao bound with the fitted smoothness as a prior: the inverse of the information.
+        """
+        return _rms(self.sigma_m)
 
     @property
     def worst_m(self) -> float:
@@ -136,6 +145,7 @@ def path_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Ta
     tally.curvature_per_m.append(found.curvature_off_per_m)
     tally.confidence.append(found.confidence[reported])
     tally.right.append((found.off_m[reported] <= TOLERANCE_M).astype(float))
+    tally.sigma_m.append(found.sigma_m[reported])
     tally.within_two_sigma.append((found.off_m <= 2 * found.sigma_m)[reported].astype(float))
     return tally
 

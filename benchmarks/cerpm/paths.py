@@ -92,13 +92,14 @@ def run_path(seed: int, short: bool) -> Result:
     note = (
         "RMS distance from the true centre line to the path [m], by lane; maximum and coverage over all lanes. The "
         'goal is met if the RMS on each route, and on the generated lanes together, meets it. "Own track" uses the '
-        "vehicle's positions as the path.\n\n"
+        'vehicle\'s positions as the path. "Bound" is the standard deviation that the markers leave on all lanes '
+        "together at best: the Cramér-Rao bound, with the smoothness that was fitted as a prior.\n\n"
         f"Curvature at 40 ft: {got:.4f} 1/m RMS, goal {CURVATURE_GOAL_PER_M}, met: {met(got <= CURVATURE_GOAL_PER_M)}. "
         "Over all rows, the mean confidence that a station is within 0.25 m of the centre is "
         f"{confidence:.1f} %; {right:.1f} % are."
     )
     head = (
-        "markers", "Karlsruhe low", "Karlsruhe moderate", "TFHRC bend", "TFHRC low", "made", "all", "max [m]",
+        "markers", "Karlsruhe low", "Karlsruhe moderate", "TFHRC bend", "TFHRC low", "made", "all", "bound", "max [m]",
         "coverage", "goal", "met", "paper's method", "own track",
     )  # fmt: skip
     return note, head, rows
@@ -139,8 +140,9 @@ def _path_row(condition: Condition, ours: dict[str, Tally], every: Tally, paper:
     goal = f"{rms}" + (f", max {worst:.2f}" if worst else "") + (f", {100 * coverage:.1f} %" if coverage else "")
     refused = f" ({paper.refused} refused)" if paper.refused else ""
     return (
-        condition.name, *(f"{tally.rms_m:.3f}" for tally in (*ours.values(), every)), f"{every.worst_m:.2f}",
-        f"{100 * every.coverage:.2f} %", goal, met(good), f"{paper.rms_m:.3f}{refused}", f"{own.rms_m:.3f}",
+        condition.name, *(f"{tally.rms_m:.3f}" for tally in (*ours.values(), every)),
+        f"{every.bound_m:.3f}", f"{every.worst_m:.2f}", f"{100 * every.coverage:.2f} %", goal,
+        met(good), f"{paper.rms_m:.3f}{refused}", f"{own.rms_m:.3f}",
     )  # fmt: skip
 
 
