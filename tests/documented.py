@@ -12,7 +12,7 @@ import orjson
 from fastapi import FastAPI
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.http.page_addresses import PAGES
+from app.api.http.ui import PAGES
 
 PROBLEM = "application/problem+json"
 _PAGES = "|".join(re.sub(r"\{\w+\}", "[^/]+", page) for page in PAGES)

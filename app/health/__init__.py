@@ -15,9 +15,9 @@ from app.health.states import Fault as Fault
 from app.health.states import HealthRules as HealthRules
 from app.health.states import MarkerState as MarkerState
 from app.health.states import Pass as Pass
-from app.health.states import StretchDrive as StretchDrive
-from app.health.states import StretchState as StretchState
 from app.health.states import VehicleState as VehicleState
 from app.health.states import Verdict as Verdict
-from app.health.states import stretch_drive as stretch_drive
-from app.health.states import update_stretch as update_stretch
+from app.health.stretches import StretchDrive as StretchDrive
+from app.health.stretches import StretchState as StretchState
+from app.health.stretches import stretch_drive as stretch_drive
+from app.health.stretches import update_stretch as update_stretch

@@ -22,8 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from app.compiled import ieee_kernel
-from app.lanes.initial_line import TRUSTED_TRACK_M, UNKNOWN_ACCURACY_M, DrivenLine
+from app.lanes.initial_line import TRUSTED_TRACK_M, DrivenLine
 from app.lanes.types import LEFT, NO_LINE, RIGHT, UNKNOWN
+from app.sensors.pose_track import UNKNOWN_ACCURACY_M
 from app.values import Bools, Floats, Ints
 
 _STEP_M = 12.5  # [m] between stations; about the paper's spacing of 12.2 m

@@ -30,17 +30,10 @@ from app.lanes.initial_line import (
     largest_group,
 )
 from app.lanes.lane_fit import LaneFit
-from app.lanes.lane_path import (
-    compare_with_track,
-    find_departure,
-    has_gaps,
-    path_from_fit,
-    path_from_splines,
-    refused_path,
-    runs_apart,
-)
+from app.lanes.lane_path import path_from_fit, path_from_splines, refused_path
 from app.lanes.observations import LaneObservations, distinct_places, observations_from_markers
 from app.lanes.smooth_line import SmoothLine, boundaries_by_splines, plane_from_wgs84
+from app.lanes.track_agreement import compare_with_track, find_departure, has_gaps, runs_apart
 from app.lanes.types import (
     LEFT,
     RIGHT,
@@ -339,7 +332,8 @@ def _compared_with_track(
     lane: Lane, track: PoseTrack, drive: DrivenLine | None, observations: LaneObservations
 ) -> Lane:
     """A lane with its agreement with the track, and with warnings where the path is elsewhere or has another shape."""
-    agreement = compare_with_track(lane, track)
+    jump_m = drive.jump_m if drive is not None else 0.0
+    agreement = compare_with_track(lane, track, jump_m)
     if agreement is None:
         if drive is None or lane.refusal is not None or not runs_apart(lane, track):
             return lane
@@ -347,7 +341,7 @@ def _compared_with_track(
         return replace(lane, track_apart=True, localization_warnings=warnings)
     off_line = [out.row for out in lane.left_out if out.reason is LeftOutReason.OFF_THE_LINE]
     of_row = observations.of_row[off_line]
-    departure = find_departure(lane, track, observations.point_m[of_row[of_row >= 0]])
+    departure = find_departure(lane, track, observations.point_m[of_row[of_row >= 0]], jump_m)
     if departure is not None:
         warning = (
             f"{departure.station_m:.0f} m along it the path turns aside where the vehicle does not, by "

@@ -161,7 +161,6 @@ _NEAR_MARKERS_M = (
 _FINE_TRACK_M = 0.25  # [m] below this noise, one fix a metre is enough; sensitivity 1.00, 1.00
 _SLOW_TO_WHITE = 0.1  # minimum noise over reported accuracy; sensitivity 1.00, 1.00
 _MAX_ACCURACY_M = 10.0  # [m] larger reported accuracies count as this
-UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; a receiver without corrections
 TRUSTED_TRACK_M = 0.5  # [m] reported accuracy below which a track shows the side of a single row; a third of
 # the 1.65 m from the centre to a boundary
 _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
@@ -234,6 +233,7 @@ def _noise(fixes_m: Floats) -> float:
 def _largest_jump_m(time_s: Floats, fixes_m: Floats, sigma_m: float) -> float:
     """The largest step between fixes that neither their noise nor a vehicle's acceleration explains. [m]"""
     step_s = np.maximum(np.diff(time_s), 1e-3)
+    fixes_m = scipy.ndimage.median_filter(fixes_m, (3, 1))  # a single wild fix is no jump
     velocity = np.diff(fixes_m, axis=0) / step_s[:, None]
     off = np.hypot(*(np.diff(velocity, axis=0) * step_s[1:, None]).T)
     near = np.maximum(step_s[1:], step_s[:-1]) < _JUMP_WITHIN_S

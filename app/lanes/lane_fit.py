@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from app.compiled import ieee_kernel
-from app.lanes.initial_line import TRUSTED_TRACK_M, UNKNOWN_ACCURACY_M, DrivenLine
+from app.lanes.initial_line import TRUSTED_TRACK_M, DrivenLine
 from app.lanes.least_squares import (
     BENDS,
     OFFSET_MODELS,
@@ -31,6 +31,7 @@ from app.lanes.observations import (
 )
 from app.lanes.smooth_line import SmoothLine, lengths_along
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, LaneRules, LeftOutReason, Notes
+from app.sensors.pose_track import UNKNOWN_ACCURACY_M
 from app.values import Bools, Floats, Ints, JsonObject
 
 # === Which boundary of the lane each marker stands on: the most likely course of the lane beside an initial line.

@@ -66,6 +66,16 @@ def lengths_along(points_m: Floats) -> Floats:
     return np.concatenate([np.zeros(1), np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
 
 
+def mean_fixes(fixes_m: Floats, step_m: float) -> Floats:
+    """Mean fixes of steps along a track, so that a vehicle that stands counts once, shape (S, 2). [m]"""
+    if len(fixes_m) < 2:
+        return fixes_m
+    _, which, count = np.unique(
+        (lengths_along(fixes_m) / step_m).astype(np.int64), return_inverse=True, return_counts=True
+    )
+    return np.stack([np.bincount(which, fixes_m[:, k]) / count for k in range(2)], 1)
+
+
 def left_normals(tangent: Floats) -> Floats:
     """Unit vectors to the left of unit tangents, shape (N, 2)."""
     return np.stack([-tangent[:, 1], tangent[:, 0]], 1)

@@ -16,6 +16,12 @@ MIN_STEP_M = 5.0  # [m] shorter steps are the receiver's noise; docs/fleet.md
 MAX_STEP_M = 50.0  # [m] of inaccurate receivers
 STEP_SIGMAS = 8.0  # accuracies in a step that counts as driven; two positions at 5.7 sigma
 DEFAULT_STEP_M = 10.0  # [m] without a reported accuracy; 8 x 1.25 m
+UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; a receiver without corrections
+# How vehicles and their receivers differ from a lane's middle; source: the upper bounds of `benchmarks.hunt.cerpm`.
+DRIVER_OFFSET_SD_M = 0.25  # [m] of a driver's usual offset
+WANDER_SD_M, WANDER_LENGTH_M = 0.25, 30.0  # [m, m] of a driver along the lane
+RECEIVER_OPTIMISM = 1.5  # true error of a receiver over the accuracy that it reports
+SLOW_SHARE = 0.3  # of a receiver's error that changes along the track like wander
 MAX_SPEED_M_S = 70.0  # [m/s] a faster step is a gap in the track; 252 km/h
 
 
@@ -48,6 +54,12 @@ class PoseTrack:
             raise InvalidParameter("times of poses do not rise", field="poses.time_s", limit="rising times")
         for name, values in arrays.items():
             object.__setattr__(self, name, values)
+
+    @property
+    def usual_accuracy_m(self) -> float:
+        """Median of the accuracies that its receiver states; that of one without corrections if it states none. [m]"""
+        stated = self.accuracy_m[np.isfinite(self.accuracy_m)]
+        return max(float(np.median(stated)), 0.0) if len(stated) else UNKNOWN_ACCURACY_M
 
     def moved(self, forward_m: float, left_m: float) -> PoseTrack:
         """The track of another point of the vehicle.

@@ -21,7 +21,6 @@ from typing_extensions import TypedDict
 from app.errors import Conflict, InvalidParameter, NotFound, Unavailable
 from app.registry.agencies import list_agencies
 from app.registry.audit import ChainReport, check_history
-from app.registry.blob_references import blob_references
 from app.registry.database import Database, head_revision, is_known_revision
 from app.registry.dumps import (
     DatabaseSummary,
@@ -34,6 +33,7 @@ from app.registry.dumps import (
     summarize_sqlite,
 )
 from app.registry.engines import across_agencies
+from app.registry.tables import blob_references
 from app.services.access.audit import parse_head
 from app.services.ports import Blobs, Clock
 from app.storage.backup_files import BackupReader, BackupWriter, DamagedBackup, new_backup, open_backup

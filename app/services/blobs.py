@@ -16,9 +16,9 @@ import structlog
 from app.errors import CommitUnknown, Conflict, Unavailable
 from app.formats.format import SpooledFile
 from app.registry.agencies import find_first_agency
-from app.registry.blob_references import blob_references
 from app.registry.database import Database
 from app.registry.engines import across_agencies
+from app.registry.tables import blob_references
 from app.services.ports import Blobs, Clock
 from app.storage.blobs import new_blob_key
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from app.registry.blob_references import blob_references
 from app.registry.database import Database
 from app.registry.decodes import decodes
 from app.registry.engines import across_agencies
@@ -16,6 +15,7 @@ from app.registry.jobs import UNFINISHED, jobs
 from app.registry.marker_rows import markers
 from app.registry.plan_features import planned_markers
 from app.registry.plan_states import plan_markers
+from app.registry.tables import blob_references
 from app.services.access.audit import AuditLog
 from app.services.blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.services.ports import utc_now

@@ -1,4 +1,4 @@
-// Which module draws which address. The server answers each address (PAGES in app/api/http/page_addresses.py; a test
+// Which module draws which address. The server answers each address (PAGES in app/api/http/ui.py; a test
 // compares the two), the module is loaded when it is needed. How to add a page: docs/web-pages.md.
 
 /**

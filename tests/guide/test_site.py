@@ -12,6 +12,7 @@ from urllib.parse import unquote
 
 import lxml.html
 import pytest
+from pydantic import SecretStr
 
 from app.api.http.problems import PROBLEMS
 from app.main import create_app
@@ -47,7 +48,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def guide_server(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
     """A server that shows it at /guide."""
     folder = tmp_path_factory.mktemp("guide-server")
-    settings = Settings(data_dir=folder, admin_key=ADMIN_KEY, warm_decoders=False, guide_dir=site)  # type: ignore[arg-type]
+    settings = Settings(data_dir=folder, admin_key=SecretStr(ADMIN_KEY), warm_decoders=False, guide_dir=site)
     with LiveServer(create_app(settings)) as server:
         yield server
 
@@ -136,7 +137,9 @@ def test_pages_are_small_enough_to_be_in_the_image(site: Path) -> None:
 
 def test_a_guide_that_is_not_built_says_how_to_build_it(tmp_path: Path) -> None:
     folder = tmp_path / "guide"
-    settings = Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, warm_decoders=False, guide_dir=folder)  # type: ignore[arg-type]
+    settings = Settings(
+        data_dir=tmp_path / "var", admin_key=SecretStr(ADMIN_KEY), warm_decoders=False, guide_dir=folder
+    )
     with LiveServer(create_app(settings)) as server, server.client(None) as client:
         for path in ("/guide", "/guide/", "/guide/plans.html"):
             problem = refused(client.get(path, follow_redirects=True), 404, "not-found")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.health import Fault, StretchDrive, StretchState, Verdict, stretch_drive, update_stretch
-from app.health.states import TURN_REACH_M
+from app.health.stretches import TURN_REACH_M
 from app.values import Floats
 
 RTK_M, PLAIN_M = 0.02, 2.0
@@ -68,8 +68,8 @@ def test_an_ordinary_receiver_needs_many_drives() -> None:
     assert verdict.offset_m[1] == pytest.approx(1.0, abs=0.5)
 
 
-def test_a_habit_is_told_from_a_shift_by_drives_in_both_directions() -> None:
-    """All drivers keep half a metre to the left: in both directions that is no shift, in one it cannot be told."""
+def test_a_habit_is_distinguished_from_a_shift_by_drives_in_both_directions() -> None:
+    """All drivers keep half a metre to the left: in both directions that is no shift, in one it may be."""
     both = [_drive(-0.5, heading) for _ in range(60) for heading in (EAST_DEG, EAST_DEG + 180.0)]
     assert _run(both) == (0, None)
     drives, verdict = _run([_drive(shift_m=(0.0, 0.7), heading_deg=EAST_DEG + 180.0 * (k % 2)) for k in range(30)])
@@ -129,7 +129,8 @@ def test_correct_stretches_are_accepted_by_receivers_that_err_as_they_state() ->
     for accuracy_m in (RTK_M, PLAIN_M):
         errors = rng.normal(0.0, math.hypot(accuracy_m, 0.2), 300)
         headings = EAST_DEG + 180.0 * rng.integers(0, 2, 300)
-        assert _run([_drive(e, h, accuracy_m) for e, h in zip(errors, headings, strict=True)]) == (0, None)  # type: ignore[arg-type]
+        driven = zip(errors.tolist(), headings.tolist(), strict=True)
+        assert _run([_drive(off_m, heading_deg, accuracy_m) for off_m, heading_deg in driven]) == (0, None)
 
 
 def test_an_inaccurate_survey_that_says_so_is_no_shift() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.lanes.estimate import fit_lane
-from app.lanes.lane_path import compare_with_track
+from app.lanes.track_agreement import compare_with_track
 from app.simulation.radio.drive import SatelliteReceiver
 from benchmarks.cerpm import scenes
 from benchmarks.scenes.road_shapes import RoadShape, lane_of_shape

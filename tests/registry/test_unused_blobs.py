@@ -11,7 +11,6 @@ import pytest
 import sqlalchemy as sa
 
 from app.registry import agencies, jobs
-from app.registry.blob_references import COLUMNS
 from app.registry.column_types import metadata, new_id
 from app.registry.database import Database
 from app.registry.decodes import decodes
@@ -20,6 +19,7 @@ from app.registry.marker_rows import markers
 from app.registry.plan_states import plans
 from app.registry.plans import alignments
 from app.registry.public_pages import damage_reports
+from app.registry.tables import BLOB_COLUMNS
 from app.services.blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs, new_blob_key
 
@@ -124,4 +124,4 @@ def test_a_store_that_another_database_uses_is_left_alone(
 
 def test_every_column_with_keys_is_known() -> None:
     named = {f"{t.name}.{c.name}" for t in metadata.sorted_tables for c in t.columns if c.name.endswith("_key")}
-    assert named == {f"{column.table.name}.{column.name}" for column in COLUMNS}
+    assert named == {f"{column.table.name}.{column.name}" for column in BLOB_COLUMNS}

@@ -11,8 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from app.api.http.page_addresses import PAGES
-from app.api.http.ui import import_map_hashes
+from app.api.http.ui import PAGES, import_map_hashes
 from app.settings import Settings
 from tests.conftest import LiveServer
 

@@ -22,10 +22,38 @@ from starlette.types import Message, Receive, Scope, Send
 
 from app import shipped_folder
 from app.api.http.openapi import STORED
-from app.api.http.page_addresses import PAGES
 from app.api.http.permissions import PUBLIC
 from app.api.http.routes import Router
 from app.errors import NotFound
+
+PAGES = (
+    "/",
+    "/markers",
+    "/markers/{marker}",
+    "/roads",
+    "/roads/new",
+    "/roads/{road}",
+    "/roads/lanes/{alignment}",
+    "/plans",
+    "/plans/new",
+    "/plans/compare",
+    "/plans/{plan}",
+    "/decode",
+    "/decodes",
+    "/decodes/{decode}",
+    "/studio/plates",
+    "/studio/magnets",
+    "/studio/cerpms",
+    "/imports",
+    "/imports/{import_job}",
+    "/operations/{section}",
+    "/operations/{section}/{item}",
+    "/sign-in",
+)
+"""Addresses of the web pages: each is answered by the same HTML file.
+
+static/app/routes.js names the module that draws each; a test compares the two.
+"""
 
 # === What browsers may do on our pages: the Content-Security-Policy, which allows nothing that is not named here.
 

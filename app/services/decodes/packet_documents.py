@@ -32,7 +32,7 @@ from app.services.decodes.packet_tasks import LaneResult
 
 DECODER_VERSION = "cerpm/3"
 MAX_REFUSED = 500
-_MAX_SIGMA_M = 0.25
+MAX_PATH_SIGMA_M = 0.25
 MAX_PROFILE = 200
 """Packets in the RSSI profile of one marker."""
 _OBSERVED = {Disagreement.MOVED: "moved", Disagreement.TWO_PLACES: "cloned", Disagreement.OUT_OF_REACH: "out-of-reach"}
@@ -176,8 +176,8 @@ def path_warnings(lane: Lane) -> list[str]:
         return [lane.refusal]
     if not np.isfinite(lane.sigma_m).all():
         return ["the method gives no standard deviation of the path"]
-    if float(np.median(lane.sigma_m)) > _MAX_SIGMA_M:
-        return [f"the standard deviation of the path is above {_MAX_SIGMA_M:g} m"]
+    if float(np.median(lane.sigma_m)) > MAX_PATH_SIGMA_M:
+        return [f"the standard deviation of the path is above {MAX_PATH_SIGMA_M:g} m"]
     if lane.track_agreement is not None and lane.track_agreement.disagrees:
         return [lane.track_agreement.reason]
     return []

@@ -72,7 +72,7 @@ class ItemEvidence(TypedDict):
     The offset of a stretch is the shift of all its markers, with its standard deviations: of the shift in its own
     direction, to the east and to the north. The last two are large in a direction that drives do not show, as along a
     straight road. `turn_deg` is the turn of the markers about the item's position, anticlockwise; `directions` counts
-    the directions of travel that were driven, 1 or 2; `check` says in plain words what to check.
+    the directions of travel that were driven, 1 or 2; `check` names what to check.
     """
 
     limit: NotRequired[float]

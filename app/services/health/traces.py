@@ -21,7 +21,7 @@ from app.decoding.recordings import DriveFiles, ReadPackets, radio_of, side_of
 from app.geodesy import enu_from_wgs84, wgs84_from_enu
 from app.health import StretchDrive, stretch_drive
 from app.health.states import LonLat
-from app.lanes.smooth_line import lengths_along, plane_from_wgs84, wgs84_from_plane
+from app.lanes.smooth_line import lengths_along, mean_fixes, plane_from_wgs84, wgs84_from_plane
 from app.lanes.types import Lane
 from app.markers.cerpm import LaneSide
 from app.markers.reading import MarkerRow, horizontal_rmse_m
@@ -31,9 +31,9 @@ from app.registry.markers import list_near
 from app.registry.spatial import distances_m
 from app.sensors.magnetometer_bar import MagnetometerBar
 from app.sensors.pose_track import PoseTrack
-from app.services.decodes.packet_documents import claimed_place
+from app.services.decodes.packet_documents import MAX_PATH_SIGMA_M, claimed_place
 from app.services.health.record import EVIDENCE, MISSED, STRETCH, rounded
-from app.values import Floats, JsonObject
+from app.values import JsonObject
 
 # === What a packet log shows of the health of CERPMs: those it received, and those that it passed and did not receive.
 
@@ -229,9 +229,7 @@ error is the same over it, and a survey or a datum seldom changes within it."""
 _STRETCH_STEP_M = 5.0  # [m] between places that are compared
 _MAX_BESIDE_M = 20.0  # [m] places further from the path are of another road; one drive shows larger shifts
 _MAX_FROM_MARKER_M = 100.0  # [m] places further from all markers belong to no stretch
-_MAX_PATH_SIGMA_M = 0.25  # [m] of the path; source: `packet_documents._MAX_SIGMA_M`
 _MIN_PLACES = 10  # on the stretch, without which a drive shows nothing of it
-_DEFAULT_ACCURACY_M = 3.0  # [m] of a receiver that states none; source: `initial_line.UNKNOWN_ACCURACY_M`
 _CELL_DEG = STRETCH_M / 111_320.0  # [deg] of latitude
 
 
@@ -271,21 +269,20 @@ def _stretch_documents(rows: Sequence[MarkerRow], lane: Lane, track: PoseTrack |
     if track is None or not rows or len(lane.station_m) < 2 or not np.isfinite(lane.heading_deg).all():
         return []
     origin = (lane.origin_lon_deg, lane.origin_lat_deg)
-    vehicle_m, along_m = _thinned(plane_from_wgs84(track.lon_deg, track.lat_deg, origin))
+    vehicle_m = mean_fixes(plane_from_wgs84(track.lon_deg, track.lat_deg, origin), _STRETCH_STEP_M)
     if len(vehicle_m) < _MIN_PLACES:
         return []
+    along_m = lengths_along(vehicle_m)
     lons_deg, lats_deg = np.array([(row.lon_deg, row.lat_deg) for row in rows]).T
     marker_m = plane_from_wgs84(lons_deg, lats_deg, origin)
     beside_m, at = (np.asarray(one) for one in scipy.spatial.cKDTree(lane.position_enu_m).query(vehicle_m))
     from_marker_m, marker = (np.asarray(one) for one in scipy.spatial.cKDTree(marker_m).query(vehicle_m))
     taken = (at > 0) & (at < len(lane.station_m) - 1) & (beside_m <= _MAX_BESIDE_M)
-    taken &= (from_marker_m <= _MAX_FROM_MARKER_M) & (lane.sigma_m[at] <= _MAX_PATH_SIGMA_M)
+    taken &= (from_marker_m <= _MAX_FROM_MARKER_M) & (lane.sigma_m[at] <= MAX_PATH_SIGMA_M)
     taken &= np.isfinite(lane.width_m[at])  # else the path is by the usual width, which is the same error each time
     for stretch in lane.stretches:
         if stretch.lane or stretch.changing:
             taken &= (lane.station_m[at] < stretch.from_m) | (lane.station_m[at] > stretch.to_m)
-    reported_m = track.accuracy_m[np.isfinite(track.accuracy_m)]
-    accuracy_m = float(np.median(reported_m)) if len(reported_m) else _DEFAULT_ACCURACY_M
     stretches = [_stretch_of(row) for row in rows]
     documents = []
     for subject, measure_m in sorted(set(stretches), key=lambda one: one[0]):
@@ -296,7 +293,7 @@ def _stretch_documents(rows: Sequence[MarkerRow], lane: Lane, track: PoseTrack |
         yaw = np.radians(90.0 - lane.heading_deg[at[here]])
         normal = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
         path_m = lane.position_enu_m[at[here]]
-        information, weighted = stretch_drive(vehicle_m[here], path_m, normal, along_m[here], accuracy_m)
+        information, weighted = stretch_drive(vehicle_m[here], path_m, normal, along_m[here], track.usual_accuracy_m)
         lon_deg, lat_deg = (float(one[0]) for one in wgs84_from_plane(path_m.mean(axis=0)[None], origin))
         heading_deg = math.degrees(math.atan2(float(np.cos(yaw).mean()), float(np.sin(yaw).mean()))) % 360.0
         registered = [row for row, stretch in zip(rows, stretches, strict=True) if stretch[0] == subject]
@@ -307,17 +304,6 @@ def _stretch_documents(rows: Sequence[MarkerRow], lane: Lane, track: PoseTrack |
             {"subject": subject, "road": registered[0].road, "measure_m": measure_m, "drive": drive.document()}
         )
     return documents
-
-
-def _thinned(track_m: Floats) -> tuple[Floats, Floats]:
-    """Mean places of steps along a track, so that a vehicle that stands counts once, and how far along they are. [m]"""
-    known = track_m[np.isfinite(track_m).all(axis=1)]
-    if len(known) < 2:
-        return known, np.zeros(len(known))
-    steps = (lengths_along(known) / _STRETCH_STEP_M).astype(np.int64)
-    _, which, count = np.unique(steps, return_inverse=True, return_counts=True)
-    thinned = np.stack([np.bincount(which, known[:, k]) / count for k in range(2)], axis=1)
-    return thinned, lengths_along(thinned)
 
 
 # === What a magnetometer trace shows of the health of tags: those it read, and those it passed over and did not read.

@@ -21,9 +21,9 @@ import structlog
 from fastapi.routing import APIRoute
 
 from app.api.http.middleware import PROTECTED
-from app.api.http.page_addresses import PAGES
 from app.api.http.problems import MEDIA_TYPE, PROBLEMS, kind_of
 from app.api.http.system import Readiness
+from app.api.http.ui import PAGES
 from app.errors import StorageFull, WaymarkError
 from app.logs import configure_logs
 from app.settings import Settings

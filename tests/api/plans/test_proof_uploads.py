@@ -151,7 +151,8 @@ def test_the_rows_of_a_proof_are_those_of_a_commit(plan: Plan, committed: dict[i
         if row.spec is not None:
             chosen = {"codebook_id": None} if "codebook_id" in stored.spec else {}
             if row.family == "cerpm":  # the line of a committed plan, which has an id
-                plan_id = stored.original["plan"]["id"]  # type: ignore[index]
+                assert stored.original is not None
+                plan_id = stored.original["plan"]["id"]
                 chosen = {"line": stored.spec["line"].removeprefix(f"{plan_id} ")}
                 assert stored.spec["line"] != chosen["line"]
             assert json.loads(json.dumps(row.spec)) == {**stored.spec, **chosen}
@@ -160,7 +161,8 @@ def test_the_rows_of_a_proof_are_those_of_a_commit(plan: Plan, committed: dict[i
 def test_a_server_estimates_the_path_of_the_proof(
     client: httpx.Client, plan: Plan, committed: dict[int, MarkerRow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wanted = {"marker_ids": [row.id for row in committed.values() if row.family == "cerpm"], "with_keys": True}
+    marker_ids = [row.id for row in committed.values() if row.family == "cerpm"]
+    wanted = {"marker_ids": marker_ids, "with_keys": True}
     programs = csv.DictReader(io.StringIO(client.post("/v1/programs", json=wanted).text))
     keys = {int(program["number"]): bytes.fromhex(program["key_hex"]) for program in programs}
     survey = Survey(monkeypatch)
@@ -173,7 +175,7 @@ def test_a_server_estimates_the_path_of_the_proof(
     ((_files, upload),), ((_given, path),) = packs, paths
     assert path.refusal is None
     survey.store(client, committed)
-    surveyed = client.get(f"/v1/markers/{wanted['marker_ids'][0]}").json()  # type: ignore[index]
+    surveyed = client.get(f"/v1/markers/{marker_ids[0]}").json()
     assert surveyed["line"] in {row.spec["line"] for row in committed.values() if row.family == "cerpm"}
     monkeypatch.undo()
     decoded = decode(client, upload.read(), "drive.zip", {"packets": {}})

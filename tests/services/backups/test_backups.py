@@ -23,11 +23,11 @@ import sqlalchemy as sa
 from app import cli
 from app.errors import Unavailable, WaymarkError
 from app.main import create_app
-from app.registry.blob_references import blob_references
 from app.registry.database import Database, head_revision
 from app.registry.dumps import copy_sqlite
 from app.registry.engines import across_agencies
 from app.registry.jobs import jobs
+from app.registry.tables import blob_references
 from app.services.backups import BackupOptions, Backups, Restores, verify_backup
 from app.services.ports import utc_now
 from app.settings import Settings
