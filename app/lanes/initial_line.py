@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from app.lanes.least_squares import difference_gram, factor, gather, gram, solve
-from app.lanes.smooth_line import SmoothLine, left_normals, lengths_along, plane_from_wgs84
+from app.lanes.smooth_line import SmoothLine, left_normals, lengths_along, plane_from_wgs84, without_wild_fixes
 from app.lanes.types import LEFT, RIGHT, UNKNOWN
 from app.sensors.pose_track import PoseTrack
 from app.values import Bools, Floats, Ints
@@ -233,7 +233,7 @@ def _noise(fixes_m: Floats) -> float:
 def _largest_jump_m(time_s: Floats, fixes_m: Floats, sigma_m: float) -> float:
     """The largest step between fixes that neither their noise nor a vehicle's acceleration explains. [m]"""
     step_s = np.maximum(np.diff(time_s), 1e-3)
-    fixes_m = scipy.ndimage.median_filter(fixes_m, (3, 1))  # a single wild fix is no jump
+    fixes_m = without_wild_fixes(time_s, fixes_m)
     velocity = np.diff(fixes_m, axis=0) / step_s[:, None]
     off = np.hypot(*(np.diff(velocity, axis=0) * step_s[1:, None]).T)
     near = np.maximum(step_s[1:], step_s[:-1]) < _JUMP_WITHIN_S

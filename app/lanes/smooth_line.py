@@ -12,6 +12,8 @@ from app.geodesy.frames import WGS84_A_M, metres_per_radian
 from app.lanes.types import LEFT, RIGHT, UNKNOWN
 from app.values import Bools, Floats, Ints
 
+_DENSE_S, _WILD_M = 0.25, 1.0  # [s] between fixes, and [m] of a wild one from those before and after it
+
 # === WGS 84 positions in a local plane, and back.
 
 
@@ -64,6 +66,20 @@ def lengths_along(points_m: Floats) -> Floats:
     """Length along a polyline up to each of its points, shape (N,). [m]"""
     step = np.diff(points_m, axis=0)
     return np.concatenate([np.zeros(1), np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
+
+
+def without_wild_fixes(time_s: Floats, fixes_m: Floats) -> Floats:
+    """Fixes of a track, single wild ones replaced by the middle of those before and after, shape (T, 2). [m]
+
+    Where fixes are too far apart to show which ones are wild, none is replaced.
+    """
+    if len(fixes_m) < 3 or np.median(np.diff(time_s)) > _DENSE_S:
+        return fixes_m
+    off = np.hypot(*(fixes_m - scipy.ndimage.median_filter(fixes_m, (3, 1))).T)
+    wild = np.flatnonzero(off[1:-1] > _WILD_M) + 1
+    fixes_m = fixes_m.copy()
+    fixes_m[wild] = (fixes_m[wild - 1] + fixes_m[wild + 1]) / 2
+    return fixes_m
 
 
 def mean_fixes(fixes_m: Floats, step_m: float) -> Floats:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from app.lanes.smooth_line import lengths_along, mean_fixes, plane_from_wgs84
+from app.lanes.smooth_line import lengths_along, mean_fixes, plane_from_wgs84, without_wild_fixes
 from app.lanes.types import MAX_TRACK_SIGNIFICANCE, MIN_TRACK_EFFECT_M, Lane, LaneRules, TrackAgreement
 from app.sensors.pose_track import (
     DRIVER_OFFSET_SD_M,
@@ -80,8 +80,7 @@ def compare_with_track(lane: Lane, track: PoseTrack, jump_m: float = 0.0) -> Tra
     """
     if not len(lane.station_m) or np.isnan(lane.curvature_per_m).any() or (np.abs(track.lat_deg) > 90).any():
         return None
-    plane = plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
-    fixes, spacing_m = _thinned(plane[_converged(track.time_s)])
+    fixes, spacing_m = _thinned(_fixes(lane, track)[_converged(track.time_s)])
     accuracy = max(RECEIVER_OPTIMISM * track.usual_accuracy_m, jump_m)
     wander = math.hypot(WANDER_SD_M, SLOW_SHARE * accuracy) * math.sqrt(max(2 * WANDER_LENGTH_M / spacing_m, 1.0))
     tree, half_width_m = scipy.spatial.cKDTree(lane.position_enu_m), _half_width_m(lane)
@@ -120,6 +119,12 @@ def runs_apart(lane: Lane, track: PoseTrack) -> bool:
     nearest_m = float(np.min(scipy.spatial.cKDTree(lane.position_enu_m).query(fixes)[0]))
     moved_m = math.hypot(*np.ptp(fixes, axis=0))
     return nearest_m > _APART_M or min(moved_m, float(lane.station_m[-1])) > _MIN_LENGTH_M
+
+
+def _fixes(lane: Lane, track: PoseTrack) -> Floats:
+    """Fixes in the plane of a path, shape (T, 2). [m]"""
+    origin = (lane.origin_lon_deg, lane.origin_lat_deg)
+    return without_wild_fixes(track.time_s, plane_from_wgs84(track.lon_deg, track.lat_deg, origin))
 
 
 def _in_lane(lane: Lane, tree: scipy.spatial.cKDTree, fixes_m: Floats, half_width_m: float) -> Bools:
@@ -340,7 +345,7 @@ class _Steps(NamedTuple):
 
 def _steps_beside(lane: Lane, track: PoseTrack) -> _Steps:
     """Positions and headings of a track at even steps, where it is beside a path."""
-    plane = plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
+    plane = _fixes(lane, track)
     along, good = lengths_along(plane), _converged(track.time_s)
     length_m = max(_SPACING_M, float(along[-1]) / _MAX_STEPS)
     first, which, count = np.unique((along[good] / length_m).astype(np.int64), return_inverse=True, return_counts=True)

@@ -32,6 +32,7 @@ RECEIVERS = {PRECISE: SatelliteReceiver.rtk, PLAIN: SatelliteReceiver.plain}
 SHIFT_M = 1.0  # [m] of all markers
 JUMP_M = (0.8, 1.9)  # [m] of half of the markers: between datums
 STEP_M, STEP_SHARE = (0.5, 1.5), (0.3, 0.7)  # [m, 1] of a receiver that goes on to state its accuracy, and where
+WILD, WILD_M = 8, 8.0  # fixes, and how far away they are [m]
 GAP_M = (100.0, 200.0)  # [m] of a tunnel
 CHANGE_M, CHANGE_LENGTH_M, BESIDE_M = 3.3, 45.0, 80.0  # [m] into the next lane, over a length, and for how long
 MOST_M = 10.0  # [m] of a receiver's error when a tunnel ends
@@ -217,6 +218,15 @@ def receiver_drift(receiver: SatelliteReceiver, rng: np.random.Generator) -> Upl
     return _with_errors(sent, lambda along, _left: drift * (along / along[-1])[:, None])
 
 
+def wild_fixes(receiver: SatelliteReceiver, rng: np.random.Generator) -> Upload:
+    """Single fixes that are metres away, in tight bends."""
+    sent = tight_bends(receiver, rng)
+    assert sent.track is not None
+    off = np.zeros((len(sent.track.time_s), 2))
+    off[rng.choice(len(off), WILD, replace=False)] = rng.normal(0, WILD_M, (WILD, 2))
+    return _with_errors(sent, lambda _along, _left: off)
+
+
 def tunnel(receiver: SatelliteReceiver, rng: np.random.Generator) -> Upload:
     """No fixes in a tunnel; afterwards an error of metres that decays."""
     sent = nothing(receiver, rng)
@@ -263,6 +273,7 @@ SCENES: dict[str, tuple[Scene, tuple[str, ...]]] = {
     "nothing": (nothing, (PRECISE, PLAIN)),
     "receiver steps": (receiver_step, (PRECISE,)),
     "receiver drifts": (receiver_drift, (PRECISE,)),
+    "eight wild fixes": (wild_fixes, (PRECISE,)),
     "tunnel": (tunnel, (PRECISE, PLAIN)),
     "vehicle overtakes outside the marked lane": (overtaking, (PRECISE, PLAIN)),
 }

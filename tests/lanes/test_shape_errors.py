@@ -54,8 +54,14 @@ def test_a_track_in_the_opposite_order_makes_the_path_unfit(receiver: Callable[[
 
 @pytest.mark.parametrize(
     "scene",
-    [shape_errors.nothing, shape_errors.receiver_step, shape_errors.tunnel, shape_errors.overtaking],
-    ids=["nothing", "step", "tunnel", "overtaking"],
+    [
+        shape_errors.nothing,
+        shape_errors.receiver_step,
+        shape_errors.wild_fixes,
+        shape_errors.tunnel,
+        shape_errors.overtaking,
+    ],
+    ids=["nothing", "step", "wild", "tunnel", "overtaking"],
 )
 def test_a_right_path_stays_fit_whatever_the_receiver_and_the_driver_do(scene: Scene) -> None:
     upload, path = decoded(scene, SatelliteReceiver.rtk, 0)
