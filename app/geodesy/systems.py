@@ -87,6 +87,45 @@ def named_system(name: str) -> CRS:
     return system
 
 
+def system_of_wkt(wkt: str) -> tuple[CRS, str]:
+    """A projected system that the EPSG registry does not list, such as a county's grid, and what it projects from.
+
+    Returns
+    -------
+    CRS
+        The projected system.
+    str
+        ``EPSG:code`` of the geographic system with the same datum: the way from one to the other is exact.
+
+    Raises
+    ------
+    ReferenceSystemError
+        It is not projected, refers to files, or its datum is not in the registry.
+    """
+    try:
+        system = CRS.from_wkt(wkt)
+    except CRSError as error:
+        raise _unusable_wkt("the file states a coordinate reference system that cannot be read") from error
+    shown = f"the file is in {system.name[:60]!r}, which has no EPSG code,"
+    base = system.geodetic_crs
+    if not system.is_projected or system.is_compound or system.is_bound or base is None or "EXTENSION[" in wkt.upper():
+        raise _unusable_wkt(f"{shown} and is not a plain projected system")
+    for listed in base.list_authority("EPSG", min_confidence=25):
+        known = named_system(f"EPSG:{listed.code}")
+        if base.datum is not None and known.datum is not None and known.datum.name == base.datum.name:
+            return system, f"EPSG:{listed.code}"
+    raise _unusable_wkt(f"{shown} and its datum {base.name[:60]!r} is not in the EPSG registry either")
+
+
+def _unusable_wkt(message: str) -> ReferenceSystemError:
+    return ReferenceSystemError(
+        message,
+        field="crs",
+        limit="an EPSG code, or a projected system on a datum of the EPSG registry",
+        cure="declare crs if the coordinates are in a system with an EPSG code; otherwise transform the file to one",
+    )
+
+
 def is_global(system: CRS) -> bool:
     """Whether coordinates in it are in WGS 84 or an ITRF, or projected from there."""
     datum = system.geodetic_crs.datum if system.geodetic_crs is not None else None

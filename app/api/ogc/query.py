@@ -47,7 +47,7 @@ _COMMON = {
     "datetime": Parameter({"type": "string"}, "Last change: a moment, a/b, ../b or a/.."),
     "limit": Parameter(
         {"type": "integer", "minimum": 1, "maximum": MAX_LIMIT, "default": DEFAULT_LIMIT},
-        "Features on a page; a number beyond the bounds is set to the nearest bound",
+        "Features on a page; a number above the maximum is set to the maximum",
     ),
     "after": Parameter({"type": "string"}, "Last id of the page before; next links have it"),
     "earlier": Parameter({"type": "string"}, "Starts of the pages before, in HTML; links of pages have it"),
@@ -264,9 +264,9 @@ def _limit(found: dict[str, str], default: int) -> int:
     text = found.get("limit")
     if text is None:
         return default
-    if not re.fullmatch(r"[+-]?[0-9]{1,200}", text, re.ASCII):
-        refuse("limit", "limit is not a whole number", f"1 to {MAX_LIMIT}; what is beyond is brought back to it")
-    return min(max(int(text), 1), MAX_LIMIT)
+    if not re.fullmatch(r"[0-9]{1,200}", text, re.ASCII) or not int(text):
+        refuse("limit", "limit is not a whole number above 0", f"1 to {MAX_LIMIT}; more is set to {MAX_LIMIT}")
+    return min(int(text), MAX_LIMIT)
 
 
 def flag_parameter(found: dict[str, str], name: str) -> bool:

@@ -186,7 +186,7 @@ def _read(kind: str, data: bytes, layer: str | None) -> SourceTable:
     x, y, z = (np.concatenate(parts) for parts in zip(*points, strict=True))
     names = tuple(str(name) for name in info["fields"])
     joined = tuple(_joined([part[k] for part in columns]) for k in range(len(names)))
-    return SourceTable(kind, names, joined, (x, y, z), crs=name_crs(info["crs"]), faults=faults)
+    return SourceTable(kind, names, joined, (x, y, z), crs=name_crs(info["crs"]) or info["crs"], faults=faults)
 
 
 def _joined(parts: list[Any]) -> Any:

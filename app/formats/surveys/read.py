@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import orjson
-from pyproj import CRS
+from pyproj import CRS, Transformer
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload
 from app.formats.format import (
@@ -44,6 +44,7 @@ from app.formats.surveys.table import (
 )
 from app.formats.text import guess_encoding
 from app.geodesy import normalize_crs, reference_system
+from app.geodesy.systems import system_of_wkt
 from app.values import Floats
 
 # === Surveys as GeoJSON (RFC 7946).
@@ -332,6 +333,13 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
             limit="a projected CRS",
             cure="declare the CRS of the control points",
         )
+    if is_local and _is_wkt(crs):
+        raise InvalidParameter(
+            f"a local grid is transformed to a CRS with an EPSG code, {system.name[:60]!r} has none",
+            field="crs",
+            limit="an EPSG code",
+            cure="declare the CRS of the control points",
+        )
     first, zone = without_zone(read.first, system) if unit == "m" and not is_local else (read.first, None)
     faults += [*read.faults, *feet, *_unit_names(source, places, unit, height_unit, has_height=has_height)]
     if not is_local:
@@ -347,16 +355,33 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
             faults += wrong
     source.faults.add(faults)
     by_content = (Detected("format", source.format, "its first bytes"),) if declaration.format is None else ()
+    second, written = read.second, None if zone is None else (read.first, read.second)
+    if _is_wkt(crs):
+        factor = unit_factor(unit, system)
+        _system, base = system_of_wkt(crs)
+        to_base = Transformer.from_crs(system, base, always_xy=True)
+        first, second = (np.asarray(v, np.float64) for v in to_base.transform(first * factor, second * factor))
+        evidence = f"the file is in {system.name[:60]!r}, a projection of it without an EPSG code; the step is exact"
+        read.detected.append(Detected("crs", base, evidence))
+        crs, unit = base, "deg"
     return SurveyTable(
-        source.format, first, read.second, read.height, bool(system.is_projected), crs, unit, height_unit, texts,
+        source.format, first, second, read.height, unit != "deg", crs, unit, height_unit, texts,
         numbers, source.faults, (*by_content, *source.detected, *detected, *read.detected),
-        written=None if zone is None else (read.first, read.second),
+        written=written,
     )  # fmt: skip
+
+
+def _is_wkt(crs: str) -> bool:
+    return "[" in crs
 
 
 def _crs(
     of_file: str | None, file_format: str, declaration: ImportDeclaration, projected: bool | None
 ) -> tuple[str, CRS]:
+    if of_file is not None and _is_wkt(of_file):
+        if declaration.crs is None:
+            return of_file, system_of_wkt(of_file)[0]
+        of_file = None  # software writes systems of the registry in words of its own
     in_file = normalize_crs(of_file) if of_file is not None else None
     if file_format == "geojson" and in_file is None:
         in_file = None if declaration.crs is not None else "OGC:CRS84"

@@ -189,7 +189,7 @@ class SourceTable:
     names: tuple[str, ...]
     columns: tuple[Sequence[Any], ...]  # one a name, of text or of numbers; None where a value is missing
     points: tuple[Floats, Floats, Floats] | None = None  # x, y, z of each row; NaN where there is none
-    crs: str | None = None  # as the file declares it, in the form ``EPSG:code``
+    crs: str | None = None  # as the file declares it: ``EPSG:code``, or WKT where that has no code
     # unit of length of the coordinates, as the file declares it; ``ft`` where it does not state which foot
     unit: str | None = None
     faults: Faults = field(default_factory=Faults)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import ezdxf
@@ -73,6 +74,37 @@ def layer(tmp_path: Path, driver: str, name: str) -> Path:
 
 def shapefile(tmp_path: Path) -> bytes:
     layer(tmp_path, "ESRI Shapefile", "survey.shp")
+    return _packed(tmp_path)
+
+
+COUNTY_GRID = (
+    'PROJCS["County_Grid_Feet",GEOGCS["{base}",DATUM["{datum}",SPHEROID["GRS_1980",6378137.0,298.257222101]],'
+    'PRIMEM["Greenwich",0.0],UNIT["Degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["False_Easting",500000.0],PARAMETER["False_Northing",0.0],PARAMETER["Central_Meridian",-93.1],'
+    'PARAMETER["Scale_Factor",1.00003],PARAMETER["Latitude_Of_Origin",44.0],UNIT["Foot_US",0.3048006096012192]]'
+)
+"""WKT of ESRI of a projection that the EPSG registry does not list."""
+
+
+def county_shapefile(tmp_path: Path, feet: Sequence[tuple[float, ...]], prj: str) -> bytes:
+    """Points in feet of a grid, with the text of their .prj."""
+    numbers = np.array([str(k + 1) for k in range(len(feet))], dtype=object)
+    shapes = shapely.to_wkb(shapely.points(feet))
+    path = tmp_path / "survey.shp"
+    raw.write(
+        path,
+        shapes,
+        [numbers],
+        ["number"],
+        driver="ESRI Shapefile",
+        geometry_type="Point Z" if len(feet[0]) > 2 else "Point",
+        crs="EPSG:4326",
+    )
+    (tmp_path / "survey.prj").write_text(prj)
+    return _packed(tmp_path)
+
+
+def _packed(tmp_path: Path) -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for part in tmp_path.glob("survey.*"):

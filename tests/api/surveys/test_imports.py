@@ -11,6 +11,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import httpx
+import pyproj
 import pytest
 
 from app.main import create_app
@@ -252,6 +253,43 @@ def test_every_format_gives_the_same_markers(client: httpx.Client, kind: str, tm
         assert number == name
         assert place[:2] == pytest.approx(true[:2], abs=2e-9)
         assert place[2] == pytest.approx(true[2], abs=1e-6)
+
+
+def _at_county(client: httpx.Client, tmp_path: Path, base: str, datum: str, **declared: object) -> httpx.Response:
+    prj = survey_files.COUNTY_GRID.format(base=base, datum=datum)
+    data = survey_files.county_shapefile(tmp_path, [(500000.0, 10000.0), (500328.0, 10000.0)], prj)
+    members = {"family": "cerpm", "columns": {"code": "number"}, "realization": "NAD83(2011)", "epoch": 2010.0}
+    return _send(client, data, {**members, **declared})
+
+
+def test_a_grid_without_an_epsg_code_is_read_by_its_own_definition(client: httpx.Client, tmp_path: Path) -> None:
+    answer = _at_county(client, tmp_path, "GCS_NAD_1983_2011", "D_NAD_1983_2011")
+    assert answer.status_code == 201, answer.text
+    assert {d["value"] for d in answer.json()["detected"] if d["what"] == "crs"} == {"EPSG:6318"}
+    found = sorted(_markers(client), key=lambda marker: marker["code"]["number"])
+    definition = (
+        "+proj=tmerc +lat_0=44 +lon_0=-93.1 +k=1.00003 +x_0=152400.3048006096 +y_0=0 +ellps=GRS80 +units=us-ft +no_defs"
+    )
+    for marker, feet in zip(found, [(500000.0, 10000.0), (500328.0, 10000.0)], strict=True):
+        lon_deg, lat_deg = pyproj.Proj(definition)(*feet, inverse=True)
+        original = marker["position"]["original"]
+        assert (original["crs"], original["realization"]) == ("EPSG:6318", "NAD83(2011)")
+        assert (original["lon_deg"], original["lat_deg"]) == pytest.approx((lon_deg, lat_deg), abs=2e-10)
+
+
+def test_a_grid_on_an_unknown_datum_is_refused_by_its_name(client: httpx.Client, tmp_path: Path) -> None:
+    problem = _at_county(client, tmp_path, "GCS_Our_Own", "D_Our_Own", dry_run=True)
+    assert problem.status_code == 422
+    assert "'County_Grid_Feet'" in problem.json()["detail"]
+    assert "no EPSG code" in problem.json()["detail"]
+
+
+def test_heights_of_a_grid_in_feet_need_a_unit(client: httpx.Client, tmp_path: Path) -> None:
+    prj = survey_files.COUNTY_GRID.format(base="GCS_NAD_1983_2011", datum="D_NAD_1983_2011")
+    data = survey_files.county_shapefile(tmp_path, [(500000.0, 10000.0, 830.0), (500328.0, 10000.0, 831.0)], prj)
+    problem = _send(client, data, {"family": "cerpm", "columns": {"code": "number"}, "vertical_datum": "EPSG:5703"})
+    assert problem.status_code == 422
+    assert problem.json()["field"] == "declaration.height_unit"
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
