@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sqlite3
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,12 @@ def _raw(store: Any) -> list[tuple[str, str, int, Any]]:
     return [("/image", image.__msgtype__, at[k], image(head[k], 20, 34, "rgb8", 0, 104, rows)) for k in range(3)]
 
 
-def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None, padding: int = 0) -> bytes:
+def sqlite_bag(
+    path: Path,
+    listed: list[tuple[str, str, int, Any]] | None = None,
+    padding: int = 0,
+    packed: Callable[[bytes], bytes] = bytes,
+) -> bytes:
     """A ROS 2 bag in SQLite, with the tables of rosbag2_storage_sqlite3 and some bytes that no reader asks for."""
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     database = sqlite3.connect(path)
@@ -113,7 +119,9 @@ def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None
             topics[topic] = len(topics) + 1
             database.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr')", (topics[topic], topic, kind))
         data = bytes(store.serialize_cdr(message, kind))
-        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", (topics[topic], at, data))
+        database.execute(
+            "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", (topics[topic], at, packed(data))
+        )
     if padding:
         database.execute(f"CREATE TABLE padding AS SELECT zeroblob({padding}) AS data")
     database.commit()
@@ -121,18 +129,23 @@ def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None
     return path.read_bytes()
 
 
-def mcap() -> bytes:
+def mcap(
+    listed: list[tuple[str, str, int, Any]] | None = None, *, recorded_late_ns: int = 0, encoding: str = "cdr"
+) -> bytes:
     """An MCAP file with pictures, positions and text."""
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    is_ros1 = encoding == "ros1"
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if is_ros1 else typesys.Stores.ROS2_HUMBLE)
     out = io.BytesIO()
     writer = Writer(out, chunk_size=4096)
-    writer.start(profile="ros2")
+    writer.start(profile="ros1" if is_ros1 else "ros2")
     channels: dict[str, int] = {}
-    for topic, kind, at, message in _messages(store):
+    for topic, kind, at, message in listed or _messages(store):
         if topic not in channels:
-            schema = writer.register_schema(kind, "ros2msg", b"")
-            channels[topic] = writer.register_channel(topic, "cdr", schema)
-        writer.add_message(channels[topic], at, bytes(store.serialize_cdr(message, kind)), at)
+            name = kind.replace("/msg/", "/") if is_ros1 else kind
+            schema = writer.register_schema(name, "ros1msg" if is_ros1 else "ros2msg", b"")
+            channels[topic] = writer.register_channel(topic, encoding, schema)
+        data = store.serialize_ros1(message, kind) if is_ros1 else store.serialize_cdr(message, kind)
+        writer.add_message(channels[topic], at + recorded_late_ns, bytes(data), at + recorded_late_ns)
     writer.finish()
     return out.getvalue()
 
@@ -171,6 +184,103 @@ def test_pictures_with_times_and_positions(kind: VideoKind, tmp_path: Path) -> N
     assert index.track.lat_deg == pytest.approx(22.3 + 1e-5 * np.arange(FRAMES))
     assert index.track.accuracy_m == pytest.approx(np.full(FRAMES, 0.5**0.5))
     assert "/chatter" in index.warnings[0]
+
+
+def _restamped(listed: list[tuple[str, str, int, Any]], topic: str, later_ns: dict[int, int]) -> list[Any]:
+    """Other stamps for single messages of a topic, by their number in it."""
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE).types
+    changed, number = [], 0
+    for name, kind, at, message in listed:
+        if name == topic:
+            if number in later_ns:
+                at_ns = at + later_ns[number]
+                stamp = store["builtin_interfaces/msg/Time"](at_ns // 10**9, at_ns % 10**9)
+                message = replace(message, header=replace(message.header, stamp=stamp))
+            number += 1
+        changed.append((name, kind, at, message))
+    return changed
+
+
+def test_times_are_those_of_exposure_where_a_bag_was_played_and_recorded_again() -> None:
+    late_ns = 184 * 86_400 * 10**9 + 250_000_000
+    index = _indexed(mcap(recorded_late_ns=late_ns))
+    assert index.created_at is not None
+    assert index.created_at.timestamp() == pytest.approx(START_NS / 1e9)
+    assert index.track is not None
+    assert index.track.time_s[0] == pytest.approx(START_NS / 1e9)
+    assert any("184.0 days after" in warning for warning in index.warnings)
+    frames = list(read_frames(index, index.segments[0], ReadReport()))
+    assert [frame.number for frame in frames] == list(range(FRAMES))
+    live = _indexed(mcap(recorded_late_ns=50_000_000))
+    assert not any("recorded" in warning for warning in live.warnings)
+
+
+@pytest.mark.parametrize("topic", ["/camera/compressed", "/gps/fix"])
+def test_times_are_those_of_recording_where_a_topic_has_no_stamps(topic: str) -> None:
+    messages = _messages(typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
+    unset = {number: -(START_NS + number * STEP_NS) for number in range(FRAMES)}
+    index = _indexed(mcap(_restamped(messages, topic, unset), recorded_late_ns=10**9))
+    assert index.created_at is not None
+    assert index.created_at.timestamp() == pytest.approx(START_NS / 1e9 + 1)
+    assert index.track is not None
+    assert index.track.time_s[0] == pytest.approx(START_NS / 1e9 + 1)
+    assert any("times of recording are used" in warning for warning in index.warnings)
+
+
+@pytest.mark.parametrize("wrong_ns", [3600 * 10**9, -3600 * 10**9])
+def test_a_picture_with_a_stamp_out_of_order_is_left_out(wrong_ns: int) -> None:
+    messages = _messages(typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
+    index = _indexed(mcap(_restamped(messages, "/camera/compressed", {4: wrong_ns})))
+    assert index.time_s == pytest.approx(np.delete(np.arange(FRAMES), 4) / 10)
+    frames = list(read_frames(index, index.segments[0], ReadReport()))
+    assert [int(frame.bgr()[5, 5, 0]) // 20 for frame in frames[3:6]] == [3, 5, 6]
+    assert any("1 pictures" in warning for warning in index.warnings)
+
+
+def test_an_mcap_file_with_messages_of_ros_1_is_read() -> None:
+    index = _indexed(mcap(encoding="ros1"))
+    assert index.time_s == pytest.approx(np.arange(FRAMES) / 10)
+    assert index.track is not None
+    assert index.track.lat_deg == pytest.approx(22.3 + 1e-5 * np.arange(FRAMES))
+    frames = list(read_frames(index, index.segments[0], ReadReport()))
+    assert [int(frame.bgr()[5, 5, 0]) // 20 for frame in frames[:3]] == [0, 1, 2]
+
+
+def test_an_mcap_file_with_messages_that_are_not_of_ros_is_refused_by_their_encoding() -> None:
+    out = io.BytesIO()
+    writer = Writer(out)
+    writer.start()
+    schema = writer.register_schema("sensor_msgs/msg/CompressedImage", "jsonschema", b"{}")
+    writer.add_message(writer.register_channel("/camera", "json", schema), START_NS, b"{}", START_NS)
+    writer.finish()
+    with pytest.raises(UnsupportedUpload, match="'json'") as refused:
+        _indexed(out.getvalue())
+    assert "ROS 2" in str(refused.value.cure)
+
+
+def test_of_several_receivers_the_one_with_positions_is_used() -> None:
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    listed = _messages(store)
+    status = store.types["sensor_msgs/msg/NavSatStatus"]
+    fixes = [(kind, at, message) for topic, kind, at, message in listed if topic == "/gps/fix"]
+    for topic, kept in (("/aaa/fix", 0), ("/zzz/fix", 5)):
+        listed += [
+            (topic, kind, at, replace(message, status=status(0 if k < kept else -1, 1)))
+            for k, (kind, at, message) in enumerate(fixes)
+        ]
+    index = _indexed(mcap(listed))
+    assert index.track is not None
+    assert len(index.track.time_s) == FRAMES
+    assert "positions held by /zzz/fix: 5; /gps/fix is used, which holds 12" in index.warnings
+    assert "positions held by /aaa/fix: 0; /gps/fix is used, which holds 12" in index.warnings
+
+
+def test_messages_that_were_compressed_one_by_one(tmp_path: Path) -> None:
+    zstandard = require_module("zstandard", "the extra bags")
+    index = _indexed(sqlite_bag(tmp_path / "a.db3", packed=zstandard.ZstdCompressor().compress))
+    assert index.time_s == pytest.approx(np.arange(FRAMES) / 10)
+    frames = list(read_frames(index, index.segments[0], ReadReport()))
+    assert [int(frame.bgr()[5, 5, 0]) // 20 for frame in frames[:3]] == [0, 1, 2]
 
 
 def test_bags_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,6 +376,41 @@ def test_raw_pictures(tmp_path: Path) -> None:
     assert (index.width_px, index.height_px) == (34, 20)
     frames = list(read_frames(index, index.segments[0], ReadReport()))
     assert [frame.bgr()[19, 33].tolist() for frame in frames] == [[0, 0, 200]] * 3
+
+
+RED = (200, 60, 20)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "cell"),
+    [
+        ("bayer_rggb8", [[[RED[0]], [RED[1]]], [[RED[1]], [RED[2]]]]),
+        ("bayer_bggr8", [[[RED[2]], [RED[1]]], [[RED[1]], [RED[0]]]]),
+        ("bayer_gbrg8", [[[RED[1]], [RED[2]]], [[RED[0]], [RED[1]]]]),
+        ("bayer_grbg8", [[[RED[1]], [RED[0]]], [[RED[2]], [RED[1]]]]),
+        ("yuv422_yuy2", [[[100, 90], [100, 192]], [[100, 90], [100, 192]]]),
+        ("uyvy", [[[90, 100], [192, 100]], [[90, 100], [192, 100]]]),
+    ],
+)
+def test_pictures_of_machine_vision_cameras(encoding: str, cell: list[Any], tmp_path: Path) -> None:
+    """One colour; its luma and colour differences by ITU-R BT.601 are 100, 90 and 192."""
+    types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE).types
+    rows = np.tile(np.array(cell, np.uint8), (10, 16, 1))
+    image, header, time_of = (
+        types[name] for name in ("sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    head = header(time_of(START_NS // 10**9, 0), "camera")
+    message = image(head, 20, 32, encoding, 0, rows[0].size, rows.ravel())
+    index = _indexed(sqlite_bag(tmp_path / "a.db3", [("/image", image.__msgtype__, START_NS, message)]))
+    (frame,) = read_frames(index, index.segments[0], ReadReport())
+    assert frame.bgr()[9, 15].tolist() == pytest.approx(RED[::-1], abs=6)
+
+
+def test_pictures_in_an_encoding_that_is_not_read_are_refused_by_its_name(tmp_path: Path) -> None:
+    raw = _raw(typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
+    listed = [(topic, kind, at, replace(message, encoding="nv21")) for topic, kind, at, message in raw]
+    with pytest.raises(UnsupportedUpload, match="'nv21'"):
+        _indexed(sqlite_bag(tmp_path / "a.db3", listed))
 
 
 def test_magnetometers_are_a_trace(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -39,10 +40,18 @@ COMPRESSED = types_of("sensor_msgs", "CompressedImage")
 RAW = types_of("sensor_msgs", "Image")
 _TO_BGR = {
     "bgr8": (3, None),
+    "8UC3": (3, None),
     "rgb8": (3, cv2.COLOR_RGB2BGR),
     "bgra8": (4, cv2.COLOR_BGRA2BGR),
     "rgba8": (4, cv2.COLOR_RGBA2BGR),
     "mono8": (1, cv2.COLOR_GRAY2BGR),
+    "8UC1": (1, cv2.COLOR_GRAY2BGR),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2BGR),
+    **dict.fromkeys(("uyvy", "yuv422"), (2, cv2.COLOR_YUV2BGR_UYVY)),
+    **dict.fromkeys(("yuyv", "yuv422_yuy2"), (2, cv2.COLOR_YUV2BGR_YUY2)),
 }
 """Bytes of a pixel and conversion by encoding. Source: sensor_msgs/image_encodings.hpp."""
 
@@ -66,7 +75,7 @@ def pixels_of(type_name: str, message: Any) -> npt.NDArray[np.uint8]:
     bytes_each, conversion = _check_raw(message)
     rows = np.frombuffer(bytes(message.data), np.uint8)[: message.height * message.step]
     used = rows.reshape(message.height, message.step)[:, : message.width * bytes_each]
-    pixels = used.reshape(message.height, message.width, bytes_each)
+    pixels = used.reshape((message.height, message.width, bytes_each)[: 2 if bytes_each == 1 else 3])
     return np.ascontiguousarray(pixels) if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
 
 
@@ -77,6 +86,8 @@ def _check_raw(message: Any) -> tuple[int, int | None]:
             f"pictures with the encoding {encoding[:40]!r} are not read", field=FIELD, limit=", ".join(_TO_BGR),
             cure="record another encoding, or the topic of compressed pictures",
         )  # fmt: skip
+    if encoding.startswith(("yuv", "yuyv", "uyvy")) and message.width % 2:
+        raise UnreadableUpload(f"a picture in {encoding} has an odd width", field=FIELD, cure="record it again")
     bytes_each, _ = _TO_BGR[encoding]
     has_rows = 0 < message.width * bytes_each <= message.step and message.height > 0
     if not has_rows or len(message.data) < message.height * message.step:
@@ -188,39 +199,89 @@ MAX_FIXES = 200_000
 """[positions] as `PoseLimits`."""
 _KINDS = {VideoKind(kind): kind for kind in BagKind}
 _NS = 1e-9
+_SINCE_NS, _UNTIL_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9
+"""[ns since 1970] 2000 and 2100: other times were written without a clock."""
+_CLOCKS_AGREE_S = 1.0
+"""[s] between exposure and recording in a live recording; larger in one that was played and recorded again."""
+
+
+class _Times(NamedTuple):
+    """Times of the messages of a topic in the order of recording, shape (N,). [ns since 1970]"""
+
+    recorded_ns: npt.NDArray[np.int64]
+    stamp_ns: npt.NDArray[np.int64]  # of their headers
+
+    @property
+    def are_stamped(self) -> bool:
+        """Whether the headers have times of a clock."""
+        return bool(np.all((self.stamp_ns >= _SINCE_NS) & (self.stamp_ns < _UNTIL_NS)))
 
 
 def index_bag(file: VideoFile, limits: VideoLimits) -> VideoIndex:
-    """List the pictures of a bag; raises as `index_video`, or `UnsupportedUpload` where bags are not read."""
+    """List the pictures of a bag; raises as `index_video`, or `UnsupportedUpload` where bags are not read.
+
+    Times are the stamps of the messages' headers, which are those of exposure; the times of recording only where a
+    topic that is used has no stamps.
+    """
     with open_bag(file.file, _KINDS[file.kind]) as bag:
         topic, warnings = _choose_topic(bag)
-        stamps: list[int] = []
+        listed: list[tuple[int, int]] = []
         first: tuple[int, int] | None = None
         for message in bag.messages([topic.name]):
             if first is None:
                 first = size_px(topic.type_name, bag.decode(message), ImageLimits(pixels=limits.pixels))
-            stamps.append(message.time_ns)
-            if len(stamps) > limits.frames:
+            listed.append((message.time_ns, message.stamp_ns))
+            if len(listed) > limits.frames:
                 raise UploadTooLarge("the bag has too many pictures", field=FIELD, limit=f"{limits.frames}")
         if first is None:
             raise _without_pictures(bag.topics)
-        track = _read_track(bag, warnings)
-    ordered = np.unique(np.array(stamps, np.int64))
-    if len(ordered) < len(stamps):
-        warnings.append(f"{len(stamps) - len(ordered)} pictures have the time of another one; they are left out")
-    if not 946_684_800 <= ordered[0] * _NS <= 4_102_444_800:
+        pictures = _Times(*np.array(listed, np.int64).T)
+        receiver = _choose_receiver(bag, warnings)
+    by_stamp = pictures.are_stamped and (receiver is None or receiver.times.are_stamped)
+    _compare_clocks(pictures, by_stamp, warnings)
+    frame_ns, recorded_ns = _rising(pictures.stamp_ns if by_stamp else pictures.recorded_ns, pictures.recorded_ns)
+    if len(frame_ns) < len(listed):
+        left_out = len(listed) - len(frame_ns)
+        warnings.append(f"{left_out} pictures have the time of another one, or are out of order; they are left out")
+    if not _SINCE_NS <= frame_ns[0] < _UNTIL_NS:
         raise UnreadableUpload(
             "the bag's pictures have no time between 2000 and 2100", field=FIELD, cure="record with the clock set"
         )
-    time_s = (ordered - ordered[0]).astype(float) * _NS
+    time_s = (frame_ns - frame_ns[0]).astype(float) * _NS
     if time_s[-1] > limits.duration_s:
         raise UploadTooLarge(f"the bag takes {time_s[-1]:.0f} s", field=FIELD, limit=f"{limits.duration_s:g} s")
-    segments = cut_segments(time_s, np.ones(len(ordered), bool), limits)
-    began_at = datetime.fromtimestamp(float(ordered[0]) * _NS, UTC)
+    segments = cut_segments(time_s, np.ones(len(frame_ns), bool), limits)
+    began_at = datetime.fromtimestamp(float(frame_ns[0]) * _NS, UTC)
     return VideoIndex(
-        file, topic.name, *first, ordered, time_s, segments, began_at, tuple(find_time_gaps(time_s)), tuple(warnings),
-        has_clock=True, track=track,
+        file, topic.name, *first, recorded_ns, time_s, segments, began_at, tuple(find_time_gaps(time_s)),
+        tuple(warnings), has_clock=True, track=_track_of(receiver, by_stamp, warnings),
     )  # fmt: skip
+
+
+def _compare_clocks(pictures: _Times, by_stamp: bool, warnings: list[str]) -> None:
+    if not by_stamp:
+        warnings.append("messages have no time between 2000 and 2100 in their headers; the times of recording are used")
+        return
+    late_s = float(np.median(pictures.recorded_ns - pictures.stamp_ns)) * _NS
+    if abs(late_s) > _CLOCKS_AGREE_S:
+        shown = f"{abs(late_s):.1f} s" if abs(late_s) < 86_400 else f"{abs(late_s) / 86_400:.1f} days"
+        order = "after" if late_s > 0 else "before"
+        warnings.append(
+            f"the pictures were recorded {shown} {order} the times in their headers, as when a bag is played and "
+            "recorded again; the times in the headers are used"
+        )
+
+
+def _rising(
+    time_ns: npt.NDArray[np.int64], recorded_ns: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Times of the messages whose times rise in the order of recording; those that are left out are as few as possible
+    where single ones are too early, or too late."""
+    last = np.maximum.accumulate(np.concatenate(([-1], time_ns[:-1])))
+    following = np.minimum.accumulate(np.concatenate((time_ns[1:], [np.iinfo(np.int64).max]))[::-1])[::-1]
+    kept = max(time_ns > last, time_ns < following, key=np.count_nonzero)
+    kept &= np.diff(recorded_ns, prepend=-1) > 0
+    return time_ns[kept], recorded_ns[kept]
 
 
 def read_pictures(index: VideoIndex, segment: VideoSegment, report: ReadReport, last: int) -> Iterator[PictureFrame]:
@@ -230,7 +291,7 @@ def read_pictures(index: VideoIndex, segment: VideoSegment, report: ReadReport, 
         done = -1
         for message in bag.messages([index.codec], start_ns=start, end_ns=end):
             number = int(np.searchsorted(index.stamps, message.time_ns))
-            if number <= done or number >= last:
+            if number <= done or number >= last or index.stamps[number] != message.time_ns:
                 continue
             done = number
             try:
@@ -270,29 +331,57 @@ def _without_pictures(topics: list[Topic]) -> InvalidParameter:
     )
 
 
-def _read_track(bag: Bag, warnings: list[str]) -> PoseTrack | None:
-    names = [topic.name for topic in bag.topics if topic.type_name in FIXES]
-    if not names:
-        return None
-    points = []
-    for entry, message in enumerate(bag.messages(names[:1])):
+class _Receiver(NamedTuple):
+    """Positions of a topic, in the order of recording."""
+
+    topic: str
+    times: _Times
+    points: tuple[PosePoint, ...]  # without their times
+
+
+def _choose_receiver(bag: Bag, warnings: list[str]) -> _Receiver | None:
+    """The topic with the most positions, of those with as many the most accurate one; warnings name the others."""
+    found = [_read_receiver(bag, topic.name) for topic in bag.topics if topic.type_name in FIXES]
+    found.sort(key=lambda one: (-len(one.points), _median_accuracy_m(one.points), one.topic))
+    for other in found[1:] if found and found[0].points else found:
+        used = f"; {found[0].topic} is used, which holds {len(found[0].points)}" if found[0].points else ""
+        warnings.append(f"positions held by {other.topic}: {len(other.points)}{used}")
+    return found[0] if found and found[0].points else None
+
+
+def _read_receiver(bag: Bag, topic: str) -> _Receiver:
+    times: list[tuple[int, int]] = []
+    points: list[PosePoint] = []
+    for entry, message in enumerate(bag.messages([topic])):
         if entry >= MAX_FIXES:
             raise UploadTooLarge("the bag holds too many positions", field=FIELD, limit=f"{MAX_FIXES}")
         fix = bag.decode(message)
         if fix.status.status < 0:
             continue  # NavSatStatus.STATUS_NO_FIX
-        points.append(PosePoint(entry, message.time_ns * _NS, fix.longitude, fix.latitude, math.nan, _accuracy_m(fix)))
-    if not points:
-        warnings.append(f"{names[0]} holds no position")
+        times.append((message.time_ns, message.stamp_ns))
+        points.append(PosePoint(entry, math.nan, fix.longitude, fix.latitude, math.nan, _accuracy_m(fix)))
+    return _Receiver(topic, _Times(*np.array(times, np.int64).reshape(-1, 2).T), tuple(points))
+
+
+def _median_accuracy_m(points: tuple[PosePoint, ...]) -> float:
+    known = [point.accuracy_m for point in points if math.isfinite(point.accuracy_m)]
+    return float(np.median(known)) if known else math.inf
+
+
+def _track_of(receiver: _Receiver | None, by_stamp: bool, warnings: list[str]) -> PoseTrack | None:
+    if receiver is None:
         return None
+    time_s = (receiver.times.stamp_ns if by_stamp else receiver.times.recorded_ns) * _NS
+    points = [replace(point, time_s=at) for point, at in zip(receiver.points, time_s.tolist(), strict=True)]
     report = LogReport()
     try:
-        track = track_of(names[0], points, report)
+        track = track_of(receiver.topic, points, report)
     except WaymarkError as error:
-        warnings.append(f"{names[0]} is not used: {error}")
+        warnings.append(f"{receiver.topic} is not used: {error}")
         return None
     if report.left_out_count:
-        warnings.append(f"{names[0]}: {report.left_out_count} positions were left out ({report.left_out[0].reason})")
+        reason = report.left_out[0].reason
+        warnings.append(f"{receiver.topic}: {report.left_out_count} positions were left out ({reason})")
     return track
 
 

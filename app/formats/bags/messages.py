@@ -22,6 +22,10 @@ MAX_CHUNK_BYTES = 256 * 1024**2
 MAX_EXPANSION = 20
 """[1] by which the chunks of a bag expand together, beyond `MAX_CHUNK_BYTES`. Recordings expand 1 to 5 times, and each
 expanded byte is read two or three times."""
+CDR, ROS1 = "cdr", "ros1"
+"""Encodings of messages: of ROS 2, and of ROS 1, which MCAP files that were converted from ROS 1 bags keep."""
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""Of messages that `ros2 bag record --compression-mode message` compressed one by one; CDR begins with a zero."""
 _CHUNK_HEAD, _RECORD_HEAD_BYTES = struct.Struct("<BQQQQ"), 9
 _SIZES = "compressed_size", "uncompressed_size"
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -57,6 +61,15 @@ class BagMessage:
     topic: Topic
     time_ns: int
     data: bytes
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the header, which types with a header begin with; 0 if it is cut off. [ns since 1970]"""
+        place, form = (4, "<II") if self.topic.encoding == ROS1 else (4, "<iI" if self.data[1:2] == b"\x01" else ">iI")
+        if len(self.data) < place + 8:
+            return 0
+        seconds, nanoseconds = struct.unpack_from(form, self.data, place)
+        return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def detect_bag(head: bytes) -> BagKind | None:
@@ -106,7 +119,7 @@ class Bag:
     def __init__(self, kind: BagKind, reader: Any) -> None:
         self._kind, self._reader = kind, reader
         self.topics: list[Topic] = list(self._list_topics())
-        self._types: Any = None
+        self._types: dict[str, Any] = {}
 
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
@@ -127,25 +140,43 @@ class Bag:
             connections = [c for c in self._reader.connections if c.topic in topics]
             if connections:
                 for connection, time_ns, data in self._reader.messages(connections, start_ns, end_ns):
-                    topic = Topic(connection.topic, connection.msgtype, "ros1")
+                    topic = Topic(connection.topic, connection.msgtype, ROS1)
                     yield _message(topic, int(time_ns), data)
 
     def decode(self, message: BagMessage) -> Any:
-        """The message as an object with the fields of its type."""
+        """The message as an object with the fields of its type.
+
+        Raises
+        ------
+        UnsupportedUpload
+            Its encoding is not that of ROS.
+        UnreadableUpload
+            It is damaged.
+        """
         from rosbags.typesys import Stores, get_typestore
 
+        topic = message.topic
+        if topic.encoding not in (CDR, ROS1):
+            raise UnsupportedUpload(
+                f"messages of {topic.name[:80]} have the encoding {topic.encoding[:40]!r}", field=FIELD,
+                limit=f"{CDR} (ROS 2) or {ROS1}", cure="convert the recording to a ROS 2 bag",
+            )  # fmt: skip
         with _defects():
-            if self._types is None:
-                self._types = get_typestore(Stores.ROS1_NOETIC if self._kind is BagKind.ROS1 else Stores.ROS2_HUMBLE)
-            if self._kind is BagKind.ROS1:
-                return self._types.deserialize_ros1(message.data, message.topic.type_name)
-            return self._types.deserialize_cdr(message.data, message.topic.type_name)
+            if topic.encoding not in self._types:
+                store = Stores.ROS1_NOETIC if topic.encoding == ROS1 else Stores.ROS2_HUMBLE
+                self._types[topic.encoding] = get_typestore(store)
+            types = self._types[topic.encoding]
+            package, _, name = topic.type_name.partition("/")
+            type_name = f"{package}/msg/{name.removeprefix('msg/')}"
+            if topic.encoding == ROS1:
+                return types.deserialize_ros1(message.data, type_name)
+            return types.deserialize_cdr(message.data, type_name)
 
     def _list_topics(self) -> Iterator[Topic]:
         with _defects():
             if self._kind is BagKind.ROS1:
                 for connection in self._reader.connections:
-                    yield Topic(connection.topic, connection.msgtype, "ros1")
+                    yield Topic(connection.topic, connection.msgtype, ROS1)
                 return
             if self._kind is BagKind.SQLITE:
                 yield from (Topic(*topic) for topic in self._reader.topics)
@@ -164,7 +195,20 @@ def _message(topic: Topic, time_ns: int, data: Any) -> BagMessage:
             f"a message of {topic.name[:80]} has the time {time_ns} ns", field=FIELD,
             limit="0 to 2^63 - 1 ns since 1970", cure="record with the clock set",
         )  # fmt: skip
-    return BagMessage(topic, time_ns, bytes(data))
+    content = bytes(data)
+    return BagMessage(topic, time_ns, _expanded(content) if content.startswith(_ZSTD_MAGIC) else content)
+
+
+def _expanded(data: bytes) -> bytes:
+    import zstandard
+
+    size = zstandard.get_frame_parameters(data).content_size
+    if size > MAX_CHUNK_BYTES and size != zstandard.CONTENTSIZE_UNKNOWN:
+        raise UploadTooLarge(
+            f"a message of the bag expands to {size} bytes", field=FIELD, limit=f"{MAX_CHUNK_BYTES} bytes",
+            cure="record smaller pictures",
+        )  # fmt: skip
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_CHUNK_BYTES)
 
 
 def _check_chunks(chunks: list[Any], stream: BinaryIO) -> None:
