@@ -6,6 +6,7 @@ applied here and nowhere else.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import zlib
@@ -21,18 +22,29 @@ import numpy.typing as npt
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.format import Format, Use, detect_signature
 
-# === EXIF of pictures: the orientation, the focal length, and when the picture was taken.
+# === EXIF of pictures: the orientation, the focal length, and when and where the picture was taken.
 #
-# Source: CIPA DC-008 (EXIF 2.32), tags 0x0112, 0x8769, 0x9003, 0x9011, 0x9291 and 0xA405.
+# Source: CIPA DC-008 (EXIF 2.32), tags 0x0112, 0x8769, 0x8825, 0x9003, 0x9011, 0x9291 and 0xA405, and in the directory
+# of GPS 1 to 4, 0x12 and 0x1F.
 
 
-_ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
+_ORIENTATION, _EXIF_IFD, _GPS_IFD = 0x0112, 0x8769, 0x8825
+_NORTH_SOUTH, _LATITUDE, _EAST_WEST, _LONGITUDE, _DATUM, _GPS_ERROR = 1, 2, 3, 4, 0x12, 0x1F
 _TAKEN, _TAKEN_OFFSET, _TAKEN_FRACTION = 0x9003, 0x9011, 0x9291
 _FOCAL_35MM = 0xA405
-_ASCII, _SHORT, _LONG = 2, 3, 4  # types of values
+_ASCII, _SHORT, _LONG, _RATIONAL = 2, 3, 4, 5  # types of values
 _DATE = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)\Z")
 _OFFSET = re.compile(r"[+-]\d\d:\d\d\Z")
 _MAX_TEXT = 64  # [byte] a date has 20
+
+
+@dataclass(frozen=True, slots=True)
+class PicturePosition:
+    """Where the camera's receiver was, in WGS 84."""
+
+    lon_deg: float
+    lat_deg: float
+    error_m: float | None  # as the receiver states it; None if it does not
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +55,7 @@ class Exif:
     # when the picture was taken, as RFC 3339 writes it; without a zone where the camera states none
     taken: str | None = None
     focal_35mm: float | None = None  # [mm] focal length that gives the same view on film of 36 x 24 mm
+    position: PicturePosition | None = None
 
 
 def read_exif(tiff: bytes) -> Exif:
@@ -50,17 +63,50 @@ def read_exif(tiff: bytes) -> Exif:
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
     if order is None or len(tiff) < 8:
         return Exif()
-    orientation, exif_at = 1, None
+    orientation, at_tag = 1, dict[int, int]()
     for tag, kind, count, at in _entries(tiff, order, _long(tiff, order, 4)):
-        if count == 1 and kind in (_SHORT, _LONG) and tag in (_ORIENTATION, _EXIF_IFD):
+        if count == 1 and kind in (_SHORT, _LONG) and tag in (_ORIENTATION, _EXIF_IFD, _GPS_IFD):
             value = int(struct.unpack_from(order + ("H" if kind == _SHORT else "I"), tiff, at)[0])
-            if tag == _EXIF_IFD:
-                exif_at = value
+            if tag != _ORIENTATION:
+                at_tag[tag] = value
             elif 1 <= value <= 8:
                 orientation = value
-    if exif_at is None:
-        return Exif(orientation)
-    return Exif(orientation, _taken(tiff, order, exif_at), _focal_35mm(tiff, order, exif_at))
+    of_camera, of_receiver = at_tag.get(_EXIF_IFD, 0), at_tag.get(_GPS_IFD, 0)
+    return Exif(
+        orientation, _taken(tiff, order, of_camera), _focal_35mm(tiff, order, of_camera),
+        _position(tiff, order, of_receiver),
+    )  # fmt: skip
+
+
+def _position(tiff: bytes, order: str, directory: int) -> PicturePosition | None:
+    """None where it is incomplete, out of range, 0, 0 as of a receiver without a position, or of another datum."""
+    texts, numbers = dict[int, str](), dict[int, float]()
+    for tag, kind, count, at in _entries(tiff, order, directory):
+        if kind == _ASCII and 0 < count <= _MAX_TEXT:
+            texts[tag] = _text(tiff, order, count, at)
+        elif kind == _RATIONAL and 0 < count <= 3:
+            numbers[tag] = _sexagesimal(tiff, _long(tiff, order, at), order, count)
+    if _plain_datum(texts.get(_DATUM, "")) not in ("", "WGS84"):
+        return None
+    lat_deg = {"N": 1, "S": -1}.get(texts.get(_NORTH_SOUTH, "")[:1], math.nan) * numbers.get(_LATITUDE, math.nan)
+    lon_deg = {"E": 1, "W": -1}.get(texts.get(_EAST_WEST, "")[:1], math.nan) * numbers.get(_LONGITUDE, math.nan)
+    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180) or lat_deg == lon_deg == 0:
+        return None
+    error_m = numbers.get(_GPS_ERROR, 0.0)
+    return PicturePosition(lon_deg, lat_deg, error_m if 0 < error_m < math.inf else None)
+
+
+def _sexagesimal(tiff: bytes, at: int, order: str, count: int) -> float:
+    """The sum of fractions of which each is of a sixtieth of the one before; NaN if one of them is none."""
+    if at + 8 * count > len(tiff):
+        return math.nan
+    pairs = struct.unpack_from(f"{order}{2 * count}I", tiff, at)
+    parts = [over / under if under else math.nan for over, under in zip(pairs[::2], pairs[1::2], strict=True)]
+    return float(sum(part / 60**k for k, part in enumerate(parts)))
+
+
+def _plain_datum(text: str) -> str:
+    return re.sub(r"[\s_-]", "", text).upper()
 
 
 def _focal_35mm(tiff: bytes, order: str, directory: int) -> float | None:
@@ -74,8 +120,7 @@ def _taken(tiff: bytes, order: str, directory: int) -> str | None:
     texts = {}
     for tag, kind, count, at in _entries(tiff, order, directory):
         if tag in (_TAKEN, _TAKEN_OFFSET, _TAKEN_FRACTION) and kind == _ASCII and 0 < count <= _MAX_TEXT:
-            start = at if count <= 4 else _long(tiff, order, at)
-            texts[tag] = tiff[start : start + count].split(b"\0")[0].decode("ascii", "replace").strip()
+            texts[tag] = _text(tiff, order, count, at)
     date = _DATE.match(texts.get(_TAKEN, ""))
     if date is None:
         return None
@@ -84,6 +129,11 @@ def _taken(tiff: bytes, order: str, directory: int) -> str | None:
     taken = f"{year}-{month}-{day}T{clock}"
     taken += f".{fraction[:6]}" if fraction.isdecimal() and fraction.isascii() else ""
     return taken + (offset if _OFFSET.match(offset) else "")
+
+
+def _text(tiff: bytes, order: str, count: int, at: int) -> str:
+    start = at if count <= 4 else _long(tiff, order, at)
+    return tiff[start : start + count].split(b"\0")[0].decode("ascii", "replace").strip()
 
 
 def _entries(tiff: bytes, order: str, directory: int) -> Iterator[tuple[int, int, int, int]]:
@@ -118,6 +168,14 @@ _JPEG_SIGNATURE = b"\xff\xd8\xff"
 _KINDS = "JPEG (8-bit) or PNG (8-bit, or 16-bit greyscale from a thermal camera)"
 SEND_AS_IT_IS = "send a JPEG or PNG as the camera wrote it"
 _OTHER_SIGNATURES = (
+    (b"\x00\x00\x00\x01", "a raw H.264 or H.265 stream"),
+    (b"\x00\x00\x01", "an MPEG program stream or a raw stream"),
+    (b"FLV", "a Flash video"),
+    (b"\x28\xb5\x2f\xfd", "compressed by zstd"),
+    (b"\x1f\x8b", "compressed by gzip"),
+    (b"7z\xbc\xaf", "a 7z archive"),
+    (b"Rar!", "a RAR archive"),
+    (b"#ROSBAG V", "a ROS bag of an old version"),
     (b"GIF8", "a GIF"),
     (b"BM", "a BMP"),
     (b"II*\x00", "a TIFF"),
@@ -131,6 +189,16 @@ _OTHER_SIGNATURES = (
     (b"<svg", "an SVG"),
     (b"<?xml", "an XML document"),
 )
+_CURES = {
+    **dict.fromkeys(
+        ("a raw H.264 or H.265 stream", "an MPEG program stream or a raw stream", "a Flash video"),
+        "convert it without loss, e.g. ffmpeg -i FILE -c copy drive.mp4",
+    ),
+    "compressed by zstd": "expand it, e.g. zstd -d FILE; bags with compressed messages or chunks are read as they are",
+    "compressed by gzip": "expand it, e.g. gunzip FILE",
+    **dict.fromkeys(("a 7z archive", "a RAR archive"), "send the file itself, or a ZIP of frames"),
+    "a ROS bag of an old version": "convert it to version 2.0, e.g. rosbag fix or rosbag reindex",
+}
 _MAX_SCANS = 64  # of a progressive JPEG; libjpeg writes about 10
 _MIRRORED = (2, 4, 5, 7)
 _MARKER = re.compile(rb"\xff+[^\xff]", re.DOTALL)
@@ -172,6 +240,7 @@ class ImageHeader:
     # when it was taken by its EXIF, as RFC 3339 writes it; without a zone where the camera states none
     taken: str | None = None
     focal_35mm: float | None = None  # [mm] focal length by its EXIF, for film of 36 x 24 mm
+    position: PicturePosition | None = None  # by its EXIF
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +284,7 @@ def unknown_picture(head: bytes, accepted: str = _KINDS, cure: str = SEND_AS_IT_
     kind = next((name for signature, name in _OTHER_SIGNATURES if head.startswith(signature)), None)
     if head[4:8] == b"ftyp":
         kind = "a video, HEIC or AVIF"
+    cure = _CURES.get(kind or "", cure)
     what = f"the file is {kind}, not a JPEG or PNG picture" if kind else "the file is not a JPEG or PNG picture"
     return UnsupportedUpload(what, field=FIELD, limit=accepted, cure=cure)
 
@@ -309,6 +379,7 @@ def _scan_jpeg(data: bytes, limits: ImageLimits) -> ScannedImage:
         len(data) - at,
         exif.taken,
         exif.focal_35mm,
+        exif.position,
     )
     return ScannedImage(header, ((0, at),))
 
@@ -398,6 +469,7 @@ def _scan_png(data: bytes, limits: ImageLimits) -> ScannedImage:
         len(data) - at,
         exif.taken,
         exif.focal_35mm,
+        exif.position,
     )
     return ScannedImage(header, tuple(parts))
 

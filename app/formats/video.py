@@ -348,9 +348,12 @@ def _decode(
             number = int(np.searchsorted(index.stamps, at)) if at is not None else len(index.stamps)
             if number == len(index.stamps) or index.stamps[number] != at:
                 continue  # not in the index
+            if counted and number < segment.first:
+                continue
+            if frame.is_corrupt:
+                failed += 1
+                continue  # the codec has filled in what was lost
             if counted:
-                if number < segment.first:
-                    continue
                 number = segment.first + failed + shown
                 shown += 1
             yield frame, number

@@ -19,7 +19,15 @@ import numpy.typing as npt
 
 from app.errors import UnreadableUpload, UnsupportedUpload, WaymarkError
 from app.formats.bags.messages import detect_bag
-from app.formats.format import ArchiveLimits, SpooledFile, count_members, is_archive, list_names, read_members
+from app.formats.format import (
+    HEAD_BYTES,
+    ArchiveLimits,
+    SpooledFile,
+    count_members,
+    is_archive,
+    list_names,
+    read_members,
+)
 from app.formats.frame_list import is_beside_frames
 from app.sensors.pose_track import PoseTrack
 
@@ -30,12 +38,19 @@ Pixels = npt.NDArray[np.uint8]
 
 # === Containers of videos, recognised by their first bytes and opened with one fixed demuxer each.
 #
-# A demuxer that is chosen by content may follow a playlist to another file. Here the first bytes choose one of three
+# A demuxer that is chosen by content may follow a playlist to another file. Here the first bytes choose one of five
 # demuxers, none of which opens other files, and the file is read through an object of ours, not by its name.
 
 
 FIELD = "file"
-EXPECTED = "MP4 or MOV (H.264, H.265, MPEG-4), AVI or raw stream (MJPEG), MCAP, ROS 2 bag (.db3) or ROS 1 bag"
+EXPECTED = (
+    "MP4, MOV, MPEG-TS or Matroska (H.264, H.265, MPEG-4), AVI or raw stream (MJPEG), MCAP, ROS 2 bag (.db3) or "
+    "ROS 1 bag"
+)
+_EBML_MAGIC = b"\x1a\x45\xdf\xa3"
+_TS_SYNC, _TS_PACKETS = 0x47, ((188, 0), (192, 4))
+"""First byte of a packet of an MPEG transport stream (ISO/IEC 13818-1); lengths of packets, and where the first one
+begins: Blu-ray and AVCHD put four bytes before each."""
 _PICTURE_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
 """Major brands of pictures in the container of MP4. Source: ISO/IEC 23008-12, section 10."""
 _OPTIONS = {"protocol_whitelist": "none", "enable_drefs": "0", "use_absolute_path": "0"}
@@ -48,6 +63,8 @@ class VideoKind(StrEnum):
     MP4 = "mp4"
     AVI = "avi"
     MJPEG = "mjpeg"
+    MPEG_TS = "mpeg-ts"
+    MATROSKA = "matroska"
     MCAP = "mcap"
     ROS1 = "ros1"
     ROS2_SQLITE = "ros2-sqlite"
@@ -55,7 +72,13 @@ class VideoKind(StrEnum):
 
 
 BAGS = (VideoKind.MCAP, VideoKind.ROS1, VideoKind.ROS2_SQLITE)
-_DEMUXERS = {VideoKind.MP4: "mov", VideoKind.AVI: "avi", VideoKind.MJPEG: "mjpeg"}
+_DEMUXERS = {
+    VideoKind.MP4: "mov",
+    VideoKind.AVI: "avi",
+    VideoKind.MJPEG: "mjpeg",
+    VideoKind.MPEG_TS: "mpegts",
+    VideoKind.MATROSKA: "matroska",
+}
 
 
 def detect_video(head: bytes, *, is_stream: bool = False) -> VideoKind | None:
@@ -64,7 +87,7 @@ def detect_video(head: bytes, *, is_stream: bool = False) -> VideoKind | None:
     Parameters
     ----------
     head : bytes
-        At least the first 12.
+        At least the first `HEAD_BYTES` of a longer file.
     is_stream : bool
         Whether a JPEG is declared to be the first of a stream of pictures.
     """
@@ -72,10 +95,20 @@ def detect_video(head: bytes, *, is_stream: bool = False) -> VideoKind | None:
         return VideoKind.MP4
     if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
         return VideoKind.AVI
+    if head.startswith(_EBML_MAGIC):
+        return VideoKind.MATROSKA
+    if any(_is_transport_stream(head, length, first) for length, first in _TS_PACKETS):
+        return VideoKind.MPEG_TS
     bag = detect_bag(head)
     if bag is not None:
         return VideoKind(bag)
     return VideoKind.MJPEG if is_stream and head[:3] == b"\xff\xd8\xff" else None
+
+
+def _is_transport_stream(head: bytes, length: int, first: int) -> bool:
+    """Whether packets of a length begin with the sync byte, three at least."""
+    starts = head[first : first + 20 * length : length]
+    return len(starts) >= 3 and not starts.strip(bytes([_TS_SYNC]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +184,7 @@ class _Part(io.RawIOBase):
 
 
 _BAG_SUFFIXES = (".db3", ".mcap", ".bag")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", *_BAG_SUFFIXES)
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".ts", ".mts", ".m2ts", ".mkv", ".webm", *_BAG_SUFFIXES)
 """Names of videos in an archive; the content decides what they are."""
 _LOCAL_HEADER_BYTES = 30  # PKWARE APPNOTE, section 4.3.7
 
@@ -211,9 +244,9 @@ def open_packed_video(file: SpooledFile, limits: ArchiveLimits) -> PackedVideo:
         name_bytes, extra_bytes = struct.unpack_from("<HH", header, 26)
         offset = info.header_offset + _LOCAL_HEADER_BYTES + name_bytes + extra_bytes
         stream.seek(offset)
-        kind = detect_video(stream.read(16))
+        kind = detect_video(stream.read(min(HEAD_BYTES, info.file_size)))
     if kind is None or info.file_size <= 0 or offset + info.file_size > file.size:
-        raise UnsupportedUpload("the file that is named as a video is none", field=FIELD, limit="MP4, MOV or AVI")
+        raise UnsupportedUpload("the file that is named as a video is none", field=FIELD, limit=EXPECTED)
     beside = tuple((m.name, m.data) for m in read_members(file, limits, only=is_beside_frames) if m.error is None)
     return PackedVideo(info.filename[-120:], VideoFile(file, kind, offset, info.file_size), beside)
 

@@ -155,6 +155,9 @@ def test_a_constant_thermal_frame_is_a_frame() -> None:
         (b"#EXTM3U\nfile:///etc/passwd", "playlist"),
         (b"<svg xmlns='http://www.w3.org/2000/svg'/>", "SVG"),
         (b"hello", "not a JPEG"),
+        (b"\x00\x00\x00\x01\x67\x64\x00\x1f", "a raw H.264 or H.265 stream"),
+        (b"\x28\xb5\x2f\xfd\x04\x00", "compressed by zstd"),
+        (b"#ROSBAG V1.2\n", "a ROS bag of an old version"),
         (b"\xff\xd8", "not a JPEG"),
     ],
 )

@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
-from app.formats.format import ArchiveLimits, SpooledFile
+from app.formats.format import HEAD_BYTES, ArchiveLimits, SpooledFile
 from app.formats.video import index_video, read_frames
 from app.formats.video_file import (
     ReadReport,
@@ -80,13 +80,16 @@ def numbers(index: VideoIndex, first: int = 0, end: int | None = None) -> list[i
         ("mpeg4", "mov", VideoKind.MP4),
         ("mjpeg", "avi", VideoKind.AVI),
         ("mjpeg", "mjpeg", VideoKind.MJPEG),
+        ("libx264", "mpegts", VideoKind.MPEG_TS),
+        ("libx264", "matroska", VideoKind.MATROSKA),
+        ("mjpeg", "matroska", VideoKind.MATROSKA),
     ],
 )
 def test_every_frame_comes_with_its_number_and_time(codec: str, form: str, kind: VideoKind) -> None:
     data = video(codec=codec, form=form)
-    assert detect_video(data[:16], is_stream=True) is kind
+    assert detect_video(data[:HEAD_BYTES], is_stream=True) is kind
     index = indexed(data, kind, rate_hz=10.0 if kind is VideoKind.MJPEG else None)
-    assert index.time_s == pytest.approx(np.arange(20) / 10, abs=1e-6)
+    assert index.time_s == pytest.approx(np.arange(20) / 10, abs=1e-3 if kind is VideoKind.MATROSKA else 2e-5)
     assert numbers(index) == list(range(20))
     assert numbers(index, 10) == list(range(10, 20))
     for frame in read_frames(index, VideoSegment(7, 8), ReadReport()):
@@ -160,8 +163,16 @@ def levels(index: VideoIndex) -> list[tuple[int, int]]:
     ]
 
 
+CONTAINERS = [
+    ("mp4", VideoKind.MP4),
+    ("avi", VideoKind.AVI),
+    ("mpegts", VideoKind.MPEG_TS),
+    ("matroska", VideoKind.MATROSKA),
+]
+
+
 @pytest.mark.parametrize("codec", ["mpeg4", "libx264"])
-@pytest.mark.parametrize(("form", "kind"), [("mp4", VideoKind.MP4), ("avi", VideoKind.AVI)])
+@pytest.mark.parametrize(("form", "kind"), CONTAINERS)
 def test_frames_are_numbered_in_the_order_in_which_they_are_shown(codec: str, form: str, kind: VideoKind) -> None:
     """B-frames are decoded after a later frame; AVI states no time at which a frame is shown."""
     index = indexed(video(300, codec=codec, form=form, group=50, between=2), kind)
@@ -196,7 +207,7 @@ def test_frames_that_the_edit_list_leaves_out_are_not_shown(between: int) -> Non
     assert index.gaps == ()
 
 
-@pytest.mark.parametrize(("form", "kind"), [("mp4", VideoKind.MP4), ("avi", VideoKind.AVI)])
+@pytest.mark.parametrize(("form", "kind"), CONTAINERS)
 @pytest.mark.parametrize("seed", range(6))
 def test_every_frame_of_a_damaged_video_is_shown_or_counted(form: str, kind: VideoKind, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -206,7 +217,8 @@ def test_every_frame_of_a_damaged_video_is_shown_or_counted(form: str, kind: Vid
         packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
     for k in rng.choice(np.arange(1, len(packets)), 20, replace=False):
         at, size = packets[int(k)]
-        data[at + 4 : at + size] = rng.bytes(size - 4)
+        start, end = (at + 188 - min(size // 2, 100), at + 188) if form == "mpegts" else (at + 4, at + size)
+        data[start:end] = rng.bytes(end - start)
     index = indexed(bytes(data), kind)
     failed = 0
     for segment in index.segments:

@@ -16,6 +16,7 @@ from typing_extensions import TypedDict
 
 from app.decoding.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.formats.frame_list import FrameList, ListedFrame
+from app.formats.images import PicturePosition
 from app.formats.logs import LogReport, has_zone
 from app.formats.text import TableWriter
 from app.geodesy.frames import metres_per_radian
@@ -97,7 +98,7 @@ class FrameLists:
 class FramePose:
     """Where the vehicle was when a frame was taken, by anything but the frame."""
 
-    source: str  # ``list``, ``track`` or ``context``
+    source: str  # ``list``, ``track``, ``context`` or ``exif``
     # `lon_deg`, `lat_deg`: [deg] WGS 84
     lon_deg: float
     lat_deg: float
@@ -175,8 +176,9 @@ class FramePlaces:
         time_s = clock.read(taken)
         return datetime.fromtimestamp(time_s, UTC) if math.isfinite(time_s) else None
 
-    def pose_of(self, at: datetime | None, name: str = "") -> FramePose | None:
-        """Where the vehicle was: by the list, by the track at that time, or as the context states for all frames."""
+    def pose_of(self, at: datetime | None, name: str = "", taken_at: PicturePosition | None = None) -> FramePose | None:
+        """Where the vehicle was: by the list, by the track at that time, as the context states for all frames, or by
+        the picture's EXIF."""
         row = self._listed.get(name)
         moving = self._on_track(at) if at is not None else None
         if row is not None and row.has_position:
@@ -186,10 +188,9 @@ class FramePlaces:
             return FramePose("list", row.lon_deg, row.lat_deg, heading, accuracy, speed, _radius_m(accuracy))
         if moving is not None:
             return moving
-        coarse = self._context.coarse_position
+        coarse, heading_deg = self._context.coarse_position, self._context.heading_deg
         if coarse is None:
-            return None
-        heading_deg = self._context.heading_deg
+            return None if taken_at is None else _pose_of_picture(taken_at, heading_deg)
         return FramePose("context", coarse.lon_deg, coarse.lat_deg, heading_deg, None, None, coarse.accuracy_m)
 
     def context_at(self, pose: FramePose | None) -> DecodeContext:
@@ -231,6 +232,11 @@ class FramePlaces:
             speed,
             _radius_m(accuracy),
         )
+
+
+def _pose_of_picture(taken_at: PicturePosition, heading_deg: float | None) -> FramePose:
+    error_m = taken_at.error_m
+    return FramePose("exif", taken_at.lon_deg, taken_at.lat_deg, heading_deg, error_m, None, _radius_m(error_m))
 
 
 def find_gaps(times: Sequence[tuple[int, datetime | None]]) -> tuple[list[GapDocument], list[str]]:

@@ -95,24 +95,30 @@ class FrameHandler(UploadHandler[FrameSignal]):
         """
         context, limits = upload.context, self._rules.images
         header = inspect_frame(upload.file, context, limits)
+        moment = _moment(context, header)
         camera = context.camera_of(header)
         picture = FramePicture(upload.file, context.is_thermal, context.thermal_range, limits)
         search: Future[FrameSearch] = Future()
         pending = self._processes.submit(decode_frame, picture, search, wait_s=upload.wait_s)
         with cancelled_on_error(pending):
             with self._database.read() as connection:
-                nearby = find_nearby_markers(connection, upload.agency_id, context.coarse_position)
+                nearby = find_nearby_markers(connection, upload.agency_id, moment.context.coarse_position)
             search.set_result(search_for(nearby, camera))
         return PendingSignal(pending, partial(FrameSignal, nearby))
 
     def match(self, connection: sa.Connection, upload: Upload, signal: FrameSignal) -> Decoded:
         """Match the frame's readings."""
-        context = upload.context
-        places = FramePlaces(context)
-        at = context.captured_at or places.time_of(0, taken=signal.result.header.taken)
-        moment = FrameMoment(context, at, places.pose_of(None))
+        moment = _moment(upload.context, signal.result.header)
         frame = read_frame(connection, upload, Member(0, ""), signal.result, signal.nearby, moment)
         return decoded_frames([frame], len(signal.nearby.codebook), upload.observed_at)
+
+
+def _moment(context: DecodeContext, header: ImageHeader) -> FrameMoment:
+    """When and where a single frame was taken."""
+    places = FramePlaces(context)
+    pose = places.pose_of(None, taken_at=header.position)
+    at = context.captured_at or places.time_of(0, taken=header.taken)
+    return FrameMoment(places.context_at(pose), at, pose)
 
 
 def inspect_frame(file: SpooledFile, context: DecodeContext, limits: ImageLimits) -> ImageHeader:
@@ -359,7 +365,7 @@ class PendingArchive:
     def _moment(self, member: Member, header: ImageHeader) -> FrameMoment:
         at = self._places.time_of(self._ordinal, member.name, header.taken)
         self._ordinal += 1
-        pose = self._places.pose_of(at, member.name)
+        pose = self._places.pose_of(at, member.name, header.position)
         return FrameMoment(self._places.context_at(pose), at, pose)
 
     def _look_for(self, nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:

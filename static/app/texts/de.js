@@ -464,6 +464,7 @@ export default {
   "decode.sigma_aa": "± längs, quer",
   "decode.sigma_en": "± Ost, Nord",
   "decode.source_context": "ungefähre Position",
+  "decode.source_exif": "EXIF des Bildes",
   "decode.source_list": "Bilderliste",
   "decode.source_track": "Track",
   "decode.speed": "Geschwindigkeit",

@@ -464,6 +464,7 @@ export default {
   "decode.sigma_aa": "± along, across",
   "decode.sigma_en": "± east, north",
   "decode.source_context": "approximate position",
+  "decode.source_exif": "EXIF of the picture",
   "decode.source_list": "list of frames",
   "decode.source_track": "track",
   "decode.speed": "Speed",

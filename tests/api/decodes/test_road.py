@@ -10,6 +10,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+from PIL import Image, TiffImagePlugin
 
 from app.geodesy import enu_from_heading, enu_from_wgs84, move_to_epoch, wgs84_from_enu
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, decimal_codes
@@ -229,8 +230,6 @@ def test_any_orientation_of_the_file_gives_the_same_readings(real_client: httpx.
     road = Road(real_client, place(), (5.0, 0.4, 8.0)).register()
     jpeg = road.frame()
     pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    from PIL import Image
-
     for orientation, turn in ((3, cv2.ROTATE_180), (6, cv2.ROTATE_90_COUNTERCLOCKWISE), (8, cv2.ROTATE_90_CLOCKWISE)):
         exif, out = Image.Exif(), io.BytesIO()
         exif[0x0112] = orientation
@@ -238,6 +237,48 @@ def test_any_orientation_of_the_file_gives_the_same_readings(real_client: httpx.
         decode = post_frame(real_client, out.getvalue(), road.context()).json()
         assert decode["frames"][0]["orientation"] == orientation
         assert road.error_m(decode["fix"]) < 0.08
+
+
+def with_gps(pixels: Any, lon_deg: float, lat_deg: float, **more: object) -> bytes:
+    """A JPEG with a position in its EXIF, as Pillow writes it."""
+    exif, out = Image.Exif(), io.BytesIO()
+    exif.get_ifd(0x8825).update(
+        {
+            1: "N" if lat_deg >= 0 else "S",
+            2: tuple(TiffImagePlugin.IFDRational(n, 10**7) for n in _sexagesimal(lat_deg)),
+            3: "E" if lon_deg >= 0 else "W",
+            4: tuple(TiffImagePlugin.IFDRational(n, 10**7) for n in _sexagesimal(lon_deg)),
+            **{int(tag): value for tag, value in more.items()},
+        }
+    )
+    Image.fromarray(pixels[..., ::-1]).save(out, "JPEG", quality=95, exif=exif)
+    return out.getvalue()
+
+
+def _sexagesimal(angle_deg: float) -> tuple[int, int, int]:
+    minutes, seconds = divmod(abs(angle_deg) * 3600, 60)
+    return int(minutes // 60) * 10**7, int(minutes % 60) * 10**7, round(seconds * 1e7)
+
+
+def test_the_position_in_the_exif_is_used_where_none_is_declared(real_client: httpx.Client, place: Place) -> None:
+    road = Road(real_client, place(), (5.0, 0.4, 8.0)).register()
+    pixels = cv2.imdecode(np.frombuffer(road.frame(), np.uint8), cv2.IMREAD_COLOR)
+    context = road.context()
+    at = context.pop("coarse_position")
+    frame = with_gps(pixels, at["lon_deg"], at["lat_deg"])
+    decode = post_frame(real_client, frame, context).json()
+    assert road.error_m(decode["fix"]) < 0.08
+    pose = decode["frames"][0]["pose"]
+    assert (pose["source"], pose["accuracy_m"]) == ("exif", None)
+    assert (pose["lon_deg"], pose["lat_deg"]) == pytest.approx((at["lon_deg"], at["lat_deg"]), abs=1e-9)
+    declared = {**context, "coarse_position": {**at, "lat_deg": at["lat_deg"] + 1.0}}
+    assert post_frame(real_client, frame, declared).json()["frames"][0]["pose"]["source"] == "context"
+
+
+@pytest.mark.parametrize("more", [{"18": "Tokyo"}, {"1": "X"}, {"2": (0.0, 0.0, 0.0), "4": (0.0, 0.0, 0.0)}])
+def test_a_position_that_is_none_is_not_used(real_client: httpx.Client, more: dict[str, object]) -> None:
+    frame = with_gps(np.full((96, 96, 3), 90, np.uint8), 139.7, 35.6, **more)
+    assert post_frame(real_client, frame, {}).json()["frames"][0]["pose"] is None
 
 
 def test_a_road_without_plates_has_no_readings(real_client: httpx.Client, place: Place) -> None:
