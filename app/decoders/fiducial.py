@@ -17,7 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.snapshot import Snapshot, SnapshotMarker
-from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting, codewords, get_dictionary
+from app.markers.fiducial import (
+    FiducialCode,
+    FiducialGeometry,
+    KnownFiducial,
+    Mounting,
+    SignImage,
+    codewords,
+    get_dictionary,
+)
 from app.markers.reading import PlatePose
 from app.sensors.camera import Camera
 from app.values import Floats
@@ -38,7 +46,8 @@ class FiducialReading:
 
     family: ClassVar[str] = "fiducial"
     outcome: FiducialOutcome
-    # shape (4, 2): [px] outer corners of the border, clockwise from the sign's upper left, pixel centres at integers
+    # shape (4, 2): [px] outer corners of the border, clockwise from the sign's upper left, pixel centres at integers;
+    # where `turned_deg` is None from the upper left of OpenCV's image
     corners_px: npt.NDArray[np.float64]
     code: FiducialCode | None
     confidence: float  # posterior probability of the most likely code, 0 to 1
@@ -49,6 +58,9 @@ class FiducialReading:
     # plate's, whatever the sign's mounting.
     pose: PlatePose | None = None
     reason: str = ""  # why the code was refused
+    # [deg] clockwise by which OpenCV's image stands turned on the sign: 0, 90, 180 or 270; of an upright sign as it was
+    # seen, of a lying one as it is registered. None where it is not known, as without a camera.
+    turned_deg: int | None = None
 
 
 # === Frame -> candidate squares -> the grey values of their modules.
@@ -189,6 +201,9 @@ def _module_px(corners_px: Floats, n: int) -> float:
 
 # === Corners of a sign and the camera -> pose of the sign.
 #
+# Which edge of an upright sign is up is seen: its sides are vertical in the vehicle's frame. So it does not matter
+# whose image the sign shows, or whether it was hung on its side. A lying sign shows nothing of the kind.
+#
 # IPPE gives the two poses of a square in closed form (Collins and Bartoli, IJCV 109, 2014). Signs are mounted plumb or
 # flat, and the mount gives the camera's attitude: the pose that fits both is taken, and a few Gauss-Newton steps
 # weigh the corners against the mounting.
@@ -199,11 +214,38 @@ CORNER_SIGMA_PX = 0.1
 tests/families/fiducial/test_fiducial_frames.py prints it, is left for lenses."""
 TILT_SIGMA_RAD = math.radians(1.5)
 """Of a sign's mounting and the vehicle's springs together. [rad]"""
+MAX_LEAN_RAD = math.radians(20.0)
+"""Of an upright sign's axis from the vertical, for which its pose is returned. [rad] Signs and vehicles lean by a few
+degrees; a sign that was hung by a corner leans by 45."""
 _STEP = 1e-6  # [m], [rad] for differences; source: the root of double precision, rounded up, for lengths of metres
 _ROUNDS = 10  # of Gauss-Newton; two or three suffice
 
 # axes of a plate (x right, y travel, z up) in the frame of an upright sign (x right, y up, z to the viewer)
 _SIGN_FROM_PLATE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def stand_upright(corners_px: Floats, camera: Camera) -> tuple[Floats, int]:
+    """Corners of an upright sign clockwise from its upper left, and the quarter turns clockwise from those that came.
+
+    Parameters
+    ----------
+    corners_px : ndarray, shape (4, 2)
+        Clockwise from any corner. [px]
+    """
+    distortion = np.array(camera.distortion or (0.0,) * 4)
+    rays = cv2.undistortPoints(corners_px.reshape(4, 1, 2), camera.matrix, distortion).reshape(4, 2)
+    up, centre = camera.camera_from_vehicle[:, 2], rays.mean(axis=0)
+    vertical = up[:2] - centre * up[2]  # the direction in which the image of a point moves as the point moves up
+    sides = [rays[k] - rays[k - 1] + rays[(k + 1) % 4] - rays[(k + 2) % 4] for k in range(4)]
+    upright = [float(side @ vertical) / max(float(np.linalg.norm(side)), 1e-12) for side in sides]
+    first = int(np.argmax(upright))
+    return np.roll(corners_px, -first, axis=0), -first % 4
+
+
+def lean_rad(pose: PlatePose, camera: Camera) -> float:
+    """Of the axis of a sign, with the axes of a plate, that should be vertical. [rad]"""
+    up = camera.camera_from_vehicle.T @ pose.rotation[:, 2]
+    return math.acos(min(max(float(up[2]), -1.0), 1.0))
 
 
 def locate_fiducial(corners_px: Floats, geometry: FiducialGeometry, camera: Camera) -> PlatePose | None:
@@ -310,7 +352,7 @@ def _tilt(pose: Floats, mounting: Mounting, camera: Camera) -> Floats:
 # where the registry expects the sign, and large ones also elsewhere; there is no other threshold.
 
 
-VERSION = "fiducial/1"
+VERSION = "fiducial/2"
 SURE = 0.99
 """Least posterior probability at which a code is returned. Source: as of plates with check digits."""
 DEFAULT_DICTIONARIES = ("apriltag-36h11", "aruco-mip-36h12", "aruco-6x6-250", "aruco-5x5-250", "apriltag-25h9")
@@ -411,7 +453,11 @@ def _read_square(
     is_sure = best.posterior >= SURE
     sign = next((sign for sign in known if sign.code.text == best.code.text), None)
     code = sign.code if sign is not None else best.code
-    pose = locate_fiducial(refined, sign.geometry, camera) if is_sure and sign and camera else None
+    pose, turned_deg, reason = None, None, ""
+    if not is_sure:
+        reason = f"{best.code.text} at {best.posterior:.3f}, {SURE:g} is needed"
+    elif sign is not None and camera is not None:
+        refined, pose, turned_deg, reason = _place(refined, sign, camera)
     return FiducialReading(
         outcome=FiducialOutcome.READ if is_sure else FiducialOutcome.UNSURE,
         corners_px=refined,
@@ -421,8 +467,34 @@ def _read_square(
         contrast=sampled.contrast,
         side_px=float(np.linalg.norm(refined - np.roll(refined, 1, axis=0), axis=1).mean()),
         pose=pose,
-        reason="" if is_sure else f"{best.code.text} at {best.posterior:.3f}, {SURE:g} is needed",
+        reason=reason,
+        turned_deg=turned_deg,
     )
+
+
+def _place(corners_px: Floats, sign: KnownFiducial, camera: Camera) -> tuple[Floats, PlatePose | None, int | None, str]:
+    """Corners from the sign's upper left, its pose, how OpenCV's image is turned on it, and why there is no pose.
+
+    Parameters
+    ----------
+    corners_px : ndarray, shape (4, 2)
+        Clockwise from the upper left of OpenCV's image. [px]
+    """
+    geometry = sign.geometry
+    turns: int | None
+    if geometry.mounting is Mounting.UPRIGHT:
+        corners_px, turns = stand_upright(corners_px, camera)
+    else:
+        turns = 2 if geometry.image is SignImage.APRILTAG else 0
+        corners_px = np.roll(corners_px, turns, axis=0)
+        if geometry.image is None and sign.code.has_two_images:
+            turns = None
+    turned_deg = None if turns is None else 90 * turns
+    pose = locate_fiducial(corners_px, geometry, camera)
+    if pose is not None and (lean := lean_rad(pose, camera)) > MAX_LEAN_RAD:
+        why = f"the sign would lean by {math.degrees(lean):.0f} degrees, so that its position is not used"
+        return corners_px, None, turned_deg, why
+    return corners_px, pose, turned_deg, ""
 
 
 def _most_likely(square: SampledSquare, names: Sequence[str], known: Sequence[KnownFiducial], squares: int) -> _Best:
@@ -521,5 +593,6 @@ def match_fiducial(
 
 def _known(marker: SnapshotMarker) -> KnownFiducial:
     kind = marker.kind
-    geometry = FiducialGeometry(kind["side_mm"], kind["quiet_mm"], Mounting(kind["mounting"]))
+    image = SignImage(kind["image"]) if kind.get("image") else None
+    geometry = FiducialGeometry(kind["side_mm"], kind["quiet_mm"], Mounting(kind["mounting"]), image)
     return KnownFiducial(FiducialCode.from_text(marker.code, kind["scheme"]), geometry)

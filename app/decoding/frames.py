@@ -185,14 +185,17 @@ class Fix:
 
 
 def fix_from_match(
-    pose: PlatePose, camera: Camera, match: Match, label: str, vehicle_heading_deg: float | None, *, epoch: float
-) -> Fix | None:
+    pose: PlatePose, camera: Camera, match: Match, label: str, vehicle_heading_deg: float | None, *, epoch: float,
+    doubt: str = "",
+) -> Fix | None:  # fmt: skip
     """Vehicle's position in the ITRF at an epoch from one matched plate.
 
     Parameters
     ----------
     label : str
         What a marker of its family is called.
+    doubt : str
+        Why the pose may be wrong, if it may.
 
     Returns
     -------
@@ -202,14 +205,14 @@ def fix_from_match(
     if match.row is None or not match.plausible:
         return None
     row = marker_at(match.row, epoch)
-    notes = row_warnings(row, label)
+    notes = [*([doubt] if doubt else []), *row_warnings(row, label)]
     if match.ambiguous:
         notes.append(f"several {label}s within reach carry these digits")
     heading_deg, heading_rmse_deg = row.heading_deg, row.heading_rmse_deg
     if heading_deg is None:
         if vehicle_heading_deg is None:
             return None
-        heading_deg = (vehicle_heading_deg + _plate_heading_in_vehicle_deg(pose, camera)) % 360.0
+        heading_deg = (vehicle_heading_deg + plate_heading_in_vehicle_deg(pose, camera)) % 360.0
         heading_rmse_deg = COARSE_HEADING_RMSE_DEG
         notes.append(f"the {label}'s heading is not registered; the vehicle's own heading was used")
     fit = not notes
@@ -270,7 +273,7 @@ def _or_assumed(value: float | None, assumed: float) -> float:
     return assumed if value is None else float(value)
 
 
-def _plate_heading_in_vehicle_deg(pose: PlatePose, camera: Camera) -> float:
+def plate_heading_in_vehicle_deg(pose: PlatePose, camera: Camera) -> float:
     """Direction of travel that the plate shows, clockwise from straight ahead of the vehicle. [deg]"""
     forward, left, _up = camera.camera_from_vehicle.T @ pose.rotation @ np.array([0.0, 1.0, 0.0])
     return -math.degrees(math.atan2(left, forward))

@@ -21,7 +21,7 @@ from app.encoders.plate.face import (
 )
 from app.encoders.plate.proof import render_face
 from app.errors import ProofFailed
-from app.markers.fiducial import FiducialCode, FiducialGeometry, Mounting, get_dictionary
+from app.markers.fiducial import FiducialCode, FiducialGeometry, Mounting, SignImage, get_dictionary
 
 # === A fiducial sign as a drawing in millimetres: its panel, its modules, and a margin for the workshop.
 
@@ -67,7 +67,8 @@ def encode_fiducial(order: FiducialOrder) -> Drawing:
 
 def _face(order: FiducialOrder) -> tuple[Part, ...]:
     """The white panel and the dark modules, as runs along the rows."""
-    geometry, modules = order.geometry, order.code.modules
+    geometry = order.geometry
+    modules = np.rot90(order.code.modules, 2) if geometry.image is SignImage.APRILTAG else order.code.modules
     half = geometry.side_mm / 2 + geometry.quiet_mm
     pitch = geometry.side_mm / len(modules)
     edges = np.diff(np.pad(modules.astype(np.int8), ((0, 0), (1, 1))), axis=1)
@@ -131,6 +132,8 @@ def prove_fiducial(drawing: Drawing, code: FiducialCode, geometry: FiducialGeome
         raise _failure(drawing, f"OpenCV reads {found or 'nothing'} instead of {code.number}")
     inset_px = geometry.quiet_mm * px_per_mm
     drawn_px = panel_px + inset_px * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+    if geometry.image is SignImage.APRILTAG:
+        drawn_px = np.roll(drawn_px, 2, axis=0)
     error_px = float(np.linalg.norm(corners[0].reshape(4, 2) - drawn_px, axis=1).max())
     if error_px > _CORNER_TOLERANCE_PX:
         raise _failure(drawing, f"its corners are {error_px:.1f} px from where they were drawn")

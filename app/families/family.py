@@ -91,6 +91,12 @@ class FrameReader(ABC, Generic[ReadingT, SearchT]):
     ) -> Match | None:
         """The registered marker of a reading; None where nothing was read or no position is known."""
 
+    def orient(
+        self, reading: ReadingT, match: Match, camera: Camera, heading_deg: float | None
+    ) -> tuple[ReadingT, str]:
+        """A reading with its pose as the matched marker and the vehicle's heading decide; why the pose is doubtful."""
+        return reading, ""
+
     @abstractmethod
     def document(self, reading: ReadingT) -> Any:
         """A reading as clients see it."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 import sqlalchemy as sa
@@ -13,7 +13,7 @@ from typing_extensions import TypedDict
 
 from app.decoders.fiducial import FiducialReading, decode_fiducials
 from app.decoding.declarations import CoarsePosition
-from app.decoding.frames import Match, Nearby, Pixels, nearest_match
+from app.decoding.frames import Match, Nearby, Pixels, nearest_match, plate_heading_in_vehicle_deg
 from app.encoders.fiducial import FiducialOrder, encode_fiducial, prove_fiducial
 from app.encoders.plate import ArtworkOptions, Drawing, PlateReader
 from app.errors import CodeTaken, InvalidParameter, WaymarkError, naming
@@ -51,7 +51,7 @@ from app.formats.surveys.table import Fault
 from app.geodesy import PlacedPosition
 from app.geodesy.frames import distance_m
 from app.inputs import Number, StrictModel, Text
-from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting, get_dictionary
+from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial, Mounting, SignImage, get_dictionary
 from app.markers.reading import MarkerRow, PlatePose
 from app.planning.outputs.hd_map import MapMarker
 from app.registry import markers as store
@@ -75,12 +75,31 @@ class FiducialGeometryIn(StrictModel):
         description="Facing the traffic, or flat on the road with its upper edge in the direction of travel.",
     )
 
+    image: SignImage | None = Field(
+        None,
+        description="Whose image of an AprilTag the sign shows the right way up: OpenCV's, which the artwork here has, "
+        "or that of AprilTag's authors, which is turned by 180 degrees.",
+    )
+
     def of_code(self, code: FiducialCode) -> FiducialGeometry:
-        """The dimensions of a sign with a code, all of them."""
+        """The dimensions of a sign with a code, all of them.
+
+        Raises
+        ------
+        InvalidParameter
+            A dimension is outside its limits, or there is only one image of this code.
+        """
+        if self.image is SignImage.APRILTAG and not code.has_two_images:
+            raise InvalidParameter(
+                f"AprilTag's authors publish no image of {code.dictionary}",
+                field="geometry.image",
+                limit="opencv",
+                cure="leave it out",
+            )
         module_mm = self.side_mm / (get_dictionary(code.dictionary).modules + 2)
         with naming("geometry"):
             quiet_mm = module_mm if self.quiet_mm is None else self.quiet_mm
-            return FiducialGeometry(self.side_mm, quiet_mm, self.mounting)
+            return FiducialGeometry(self.side_mm, quiet_mm, self.mounting, self.image)
 
 
 FIDUCIAL_EXAMPLES: list[JsonValue] = [
@@ -153,7 +172,8 @@ def fiducial_code(row: MarkerRow) -> FiducialCode:
 def fiducial_geometry(row: MarkerRow) -> FiducialGeometry:
     """Dimensions and mounting of a sign's row."""
     spec = row.spec
-    return FiducialGeometry(spec["side_mm"], spec["quiet_mm"], Mounting(spec["mounting"]))
+    image = SignImage(spec["image"]) if spec.get("image") else None
+    return FiducialGeometry(spec["side_mm"], spec["quiet_mm"], Mounting(spec["mounting"]), image)
 
 
 def known_fiducial(row: MarkerRow) -> KnownFiducial:
@@ -186,6 +206,13 @@ class FiducialReadingDocument(TypedDict):
     corners_px: list[list[float]]
     side_px: float
     pose: PlatePose | None
+    turned_deg: Annotated[
+        int | None,
+        Field(
+            description="Clockwise by which OpenCV's image stands turned on the sign: as it is seen of an upright "
+            "sign, as it is registered of a lying one; null where it is not known. [deg]"
+        ),
+    ]
 
 
 class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
@@ -234,7 +261,27 @@ class FiducialFrames(FrameReader[FiducialReading, FiducialSearch]):
             "corners_px": rounded(reading.corners_px, 3) or [],
             "side_px": round(float(reading.side_px), 2),
             "pose": reading.pose,
+            "turned_deg": reading.turned_deg,
         }
+
+    def orient(
+        self, reading: FiducialReading, match: Match, camera: Camera, heading_deg: float | None
+    ) -> tuple[FiducialReading, str]:
+        """A lying AprilTag of which it is not stated whose image it shows: the vehicle's heading decides."""
+        row, pose = match.row, reading.pose
+        if row is None or row.heading_deg is None or pose is None or reading.turned_deg is not None:
+            return reading, ""
+        if heading_deg is None:
+            return reading, (
+                "the sign lies on the road, and it is not stated whose image of the AprilTag it shows: the position "
+                "may be on the other side of it; register geometry.image, or send heading_deg"
+            )
+        by_opencv_deg = (row.heading_deg - plate_heading_in_vehicle_deg(pose, camera) - heading_deg) % 360.0
+        if not 90.0 < by_opencv_deg < 270.0:
+            return replace(reading, turned_deg=0), ""
+        pose = replace(pose, rotation=pose.rotation * np.array([-1.0, -1.0, 1.0]))
+        corners_px = np.roll(reading.corners_px, 2, axis=0)
+        return replace(reading, pose=pose, corners_px=corners_px, turned_deg=180), ""
 
     def observation(self, reading: FiducialReading) -> dict[str, object]:
         """Confidence and errors."""

@@ -133,8 +133,13 @@ class FiducialCode:
 
     @property
     def modules(self) -> npt.NDArray[np.uint8]:
-        """The face with its border, dark = 1, shape (n + 2, n + 2)."""
+        """The face with its border as OpenCV's image has it, dark = 1, shape (n + 2, n + 2)."""
         return np.pad(codewords(self.dictionary)[self.number], 1, constant_values=1)
+
+    @property
+    def has_two_images(self) -> bool:
+        """Whether the sign may show the image of AprilTag's authors."""
+        return self.dictionary.startswith("apriltag-")
 
 
 class Mounting(StrEnum):
@@ -142,6 +147,18 @@ class Mounting(StrEnum):
 
     UPRIGHT = "upright"
     LYING = "lying"
+
+
+class SignImage(StrEnum):
+    """Whose image a sign shows the right way up.
+
+    The images that AprilTag's authors publish are those of OpenCV turned by 180 degrees, in all dictionaries of
+    AprilTag. That was the same in OpenCV 4.10 to 4.13 and 5.0, whatever refines the corners:
+    tests/families/fiducial/test_real_tags.py reads the published images.
+    """
+
+    OPENCV = "opencv"
+    APRILTAG = "apriltag"
 
 
 @with_config(INPUT)
@@ -152,6 +169,7 @@ class FiducialGeometry:
     side_mm: float  # [mm] outer edge of the black border, 30 to 3000
     quiet_mm: float  # [mm] width of the white zone round the border, 0 to 1000
     mounting: Mounting = Mounting.UPRIGHT
+    image: SignImage | None = None  # None: not stated; of ArUco there is only OpenCV's
 
     def __post_init__(self) -> None:
         """Raises InvalidParameter if a dimension is outside its limits."""

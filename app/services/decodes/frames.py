@@ -165,9 +165,11 @@ def read_frame(
             reading = with_registered_size(found, match, camera)
         reading = at_middle_row(reading, camera, speed_m_s)
         fix = None
-        if match is not None and camera is not None and reading.pose is not None:
-            label = get_family(reading.family).label
-            fix = fix_from_match(reading.pose, camera, match, label, context.heading_deg, epoch=epoch)
+        if match is not None and camera is not None:
+            heading_deg, label = context.heading_deg, get_family(reading.family).label
+            reading, doubt = FRAME_READERS[reading.family].orient(reading, match, camera, heading_deg)
+            if reading.pose is not None:
+                fix = fix_from_match(reading.pose, camera, match, label, heading_deg, epoch=epoch, doubt=doubt)
         markers.append(ReadMarker(reading, match, fix))
     frame = ReadFrame(
         index=member.index,

@@ -3843,11 +3843,14 @@ export interface components {
             version: number;
         };
         FiducialGeometry: {
+            image: components["schemas"]["SignImage"] | null;
             mounting: components["schemas"]["Mounting"];
             quiet_mm: number;
             side_mm: number;
         };
         FiducialGeometryIn: {
+            /** @default null */
+            image?: components["schemas"]["SignImage"] | null;
             /** @default upright */
             mounting?: components["schemas"]["Mounting"];
             /** @default null */
@@ -3899,6 +3902,7 @@ export interface components {
             reason: string | null;
             scheme: string | null;
             side_px: number;
+            turned_deg: number | null;
         };
         FieldErrorDocument: {
             cure?: string;
@@ -6481,6 +6485,8 @@ export interface components {
             north_m: number;
             up_m: number | null;
         };
+        /** @enum {string} */
+        SignImage: "opencv" | "apriltag";
         SignIn: {
             dictionary: string;
             geometry: components["schemas"]["FiducialGeometryIn"];

@@ -71,7 +71,7 @@ def test_the_vehicle_is_found_by_a_sign(
     # to the left is against the clock, by which headings count; a sign that faces the vehicle has its heading
     body = sign(vehicle, number=40 + int(ahead_m)) | {
         "position": position,
-        "geometry": {"side_mm": SIDE_MM, "quiet_mm": QUIET_MM, "mounting": mounting},
+        "geometry": {"side_mm": SIDE_MM, "quiet_mm": QUIET_MM, "mounting": mounting, "image": "opencv"},
         "heading_deg": (HEADING_DEG - turn_deg) % 360.0,
         "heading_rmse_deg": 0.2,
         "status": "surveyed",
@@ -102,6 +102,50 @@ def test_the_vehicle_is_found_by_a_sign(
     elsewhere = {**coarse, "lon_deg": coarse["lon_deg"] + 0.1}
     unmatched = post_frame(client, data, {"coarse_position": elsewhere, "camera": CAMERA_IN}).json()
     assert [reading for reading in unmatched["readings"] if reading["family"] == "fiducial"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("image", "declared_deg", "grade"),
+    [(None, HEADING_DEG + 40.0, "cm"), (None, None, "unfit"), ("apriltag", None, "cm")],
+)
+def test_a_lying_sign_with_the_image_of_its_authors(
+    client: httpx.Client, place: Callable[[], dict[str, Any]], image: str | None, declared_deg: float | None, grade: str
+) -> None:
+    vehicle, in_vehicle = place(), np.array([6.0, 0.3, 0.0])
+    origin = (vehicle["lon_deg"], vehicle["lat_deg"], 40.0)
+    enu_m = enu_from_heading(HEADING_DEG) @ np.array([-in_vehicle[1], in_vehicle[0], in_vehicle[2]])
+    lon, lat, height = wgs84_from_enu(enu_m, origin)
+    position = {"lon_deg": lon, "lat_deg": lat, "height_m": height, "horizontal_rmse_m": 0.01, "vertical_rmse_m": 0.02}
+    geometry = {"side_mm": SIDE_MM, "quiet_mm": QUIET_MM, "mounting": "lying", "image": image}
+    body = sign(vehicle, number=60) | {
+        "position": {**position, "realization": "ITRF2014", "epoch": 2026.4},
+        "geometry": geometry,
+        "heading_deg": HEADING_DEG,
+        "heading_rmse_deg": 0.2,
+        "status": "surveyed",
+    }
+    panel = panel_of(client, post(client, body))
+    if image is None:
+        panel = np.ascontiguousarray(np.rot90(panel, 2))  # the artwork here is OpenCV's
+    panel_m = (SIDE_MM + 2 * QUIET_MM) / 1000
+    picture = render_sign(CAMERA, panel, lying_axes(0.0), in_vehicle, panel_m, np.random.default_rng(6))
+    context = {
+        "coarse_position": {"lon_deg": origin[0] + 3e-5, "lat_deg": origin[1] - 3e-5, "accuracy_m": 10.0},
+        "camera": CAMERA_IN,
+        "captured_at": "2026-05-27T00:00:00Z",
+        **({"heading_deg": declared_deg} if declared_deg is not None else {}),
+    }
+    decode = post_frame(client, cv2.imencode(".png", picture)[1].tobytes(), context).json()
+    fix = decode["fix"]
+    assert fix["localization_grade"] == grade
+    error_m = np.linalg.norm(enu_from_wgs84(fix["lon_deg"], fix["lat_deg"], fix["height_m"], origin))
+    if grade == "cm":
+        assert error_m < 0.05
+    else:
+        assert any("whose image" in note for note in fix["notes"])
+    (reading,) = [reading for reading in decode["readings"] if reading["family"] == "fiducial"]
+    assert reading["turned_deg"] == (180 if grade == "cm" else None)
 
 
 @pytest.mark.slow

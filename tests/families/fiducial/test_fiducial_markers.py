@@ -47,7 +47,7 @@ def test_a_sign_is_registered_read_and_listed(client: httpx.Client, place: Place
     assert made["code"] == {
         "scheme": "apriltag-36h11", "text": "apriltag-36h11-17", "dictionary": "apriltag-36h11", "number": 17
     }  # fmt: skip
-    assert made["geometry"] == {"side_mm": 400.0, "quiet_mm": 50.0, "mounting": "upright"}
+    assert made["geometry"] == {"side_mm": 400.0, "quiet_mm": 50.0, "mounting": "upright", "image": None}
     assert client.get(f"/v1/markers/{made['id']}").json() == made
     query = {"family": "fiducial", "code": "apriltag-36h11-17"}
     assert made["id"] in [item["id"] for item in client.get("/v1/markers", params=query).json()["items"]]
