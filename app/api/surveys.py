@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from fastapi import Depends, Request, Response
+from fastapi import Depends, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
@@ -34,7 +34,7 @@ from app.services.idempotency import IdempotencyKey
 from app.services.markers.searches import checked_box
 from app.services.progress import ImportJob, OtherJob
 from app.services.request_work import counted_steps
-from app.services.surveys.exports import MAX_LEFT_OUT_IDS, STREAMED, SUFFIXES, WHOLE, ExportJobs, filter_of
+from app.services.surveys.exports import MAX_LEFT_OUT_IDS, STREAMED, SUFFIXES, WHOLE, ExportJobs, filter_of, frame_of
 from app.services.surveys.exports import Exports as ExportsService
 from app.services.surveys.import_jobs import ImportJobs, takes_long
 from app.services.surveys.import_report import (
@@ -165,6 +165,14 @@ _Measure = Annotated[float, Field(strict=True, ge=-1e8, le=1e8, allow_inf_nan=Fa
 Exports = Annotated[ExportsService, use_case(lambda cases: cases.exports)]
 
 
+_Crs = Annotated[Text, Field(min_length=1, max_length=64)]
+_Epoch = Annotated[float, Field(ge=1950, le=2200, allow_inf_nan=False)]
+_CRS_HELP = "Of the coordinates, such as EPSG:25832."
+_REALIZATION_HELP = "Of the crs, such as ETRF2000; without, that in which each marker came."
+_EPOCH_HELP = "Of the coordinates; without, that of each marker. [decimal year]"
+_DATUM_HELP = "Of the heights: ellipsoid, or such as EPSG:7837; without, each is above its own."
+
+
 class ExportIn(StrictModel):
     """Markers to write into a file; without a filter, all of them."""
 
@@ -180,6 +188,10 @@ class ExportIn(StrictModel):
     to_m: _Measure | None = Field(None, description="Greatest measure on the road. [m]")
     status: Status | None = None
     family: FamilyName | None = None
+    crs: _Crs | None = Field(None, description=_CRS_HELP)
+    realization: _Crs | None = Field(None, description=_REALIZATION_HELP)
+    epoch: _Epoch | None = Field(None, description=_EPOCH_HELP)
+    vertical_datum: _Crs | None = Field(None, description=_DATUM_HELP)
 
     def wanted(self) -> JsonObject:
         """What is wanted, checked, as it is stored in a job."""
@@ -187,6 +199,7 @@ class ExportIn(StrictModel):
             checked_box(*self.bbox)
         wanted = self.model_dump(mode="json", exclude_none=True)
         check_measures(filter_of(wanted))
+        frame_of(wanted)
         return wanted
 
 
@@ -223,6 +236,10 @@ def get_export(
     caller: Caller,
     exports: Exports,
     filtered: Filtered,
+    crs: Annotated[_Crs | None, Query(description=_CRS_HELP)] = None,
+    realization: Annotated[_Crs | None, Query(description=_REALIZATION_HELP)] = None,
+    epoch: Annotated[_Epoch | None, Query(description=_EPOCH_HELP)] = None,
+    vertical_datum: Annotated[_Crs | None, Query(description=_DATUM_HELP)] = None,
 ) -> Response:
     """Download markers as a file.
 
@@ -230,15 +247,18 @@ def get_export(
 
     The filters are those of GET /v1/markers.
 
-    Positions are longitude and latitude in WGS 84 / ITRF; LandXML and DXF are in the UTM zone that most of them lie in.
-    Markers too far from it are left out: the file lists them, and the header Waymark-Left-Out has their number and the
-    first ids. Retired markers are in LandXML and DXF only with status=retired.
+    Without crs, positions are longitude and latitude in WGS 84 / ITRF; LandXML and DXF are in the projected system in
+    which most of the markers came, or else in the UTM zone that most of them lie in. Markers outside its area are left
+    out: the file lists them, and the header Waymark-Left-Out has their number and the first ids. Retired markers are in
+    LandXML and DXF only with status=retired.
     """
+    wanted = {"crs": crs, "realization": realization, "epoch": epoch, "vertical_datum": vertical_datum}
+    frame = frame_of(wanted)
     headers = {"Content-Disposition": f'attachment; filename="markers.{SUFFIXES.get(kind, kind)}"'}
     if kind in STREAMED:
-        chunks, media_type = exports.stream(caller, kind, filtered), STREAMED[kind]
+        chunks, media_type = exports.stream(caller, kind, filtered, frame), STREAMED[kind]
     else:
-        (chunks, left_out), media_type = exports.whole(caller, kind, filtered), WHOLE[kind]
+        (chunks, left_out), media_type = exports.whole(caller, kind, filtered, frame), WHOLE[kind]
         if left_out:
             headers["Waymark-Left-Out"] = f"{len(left_out)}; {' '.join(left_out[:MAX_LEFT_OUT_IDS])}"
     return StreamingResponse(counted_steps(chunks), headers=headers, media_type=media_type)

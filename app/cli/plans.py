@@ -91,7 +91,10 @@ def plan(
         )
         made = _make(console, road, rules, declaration, name or road.stem)
         options = PackageOptions(
-            stakeout_crs, cast("Unit | None", stakeout_unit), scale, TitleBlock(owner, number, date, creator, approver)
+            stakeout_crs,
+            cast("Unit | None", stakeout_unit),
+            scale=scale,
+            title_block=TitleBlock(owner, number, date, creator, approver),
         )
         _write(console, made, out, options, artwork=artwork)
     _print(made, out)

@@ -86,8 +86,20 @@ class Commitment:
             "lon_deg": marker.lon_deg,
             "lat_deg": marker.lat_deg,
             **({"height_m": marker.height_m} if marker.height_m is not None else {}),
-            "plan": {"id": self.plan_id, **{name: getattr(marker, name) for name in _PLACE_IN_PLAN}},
+            "plan": {
+                "id": self.plan_id,
+                **{name: getattr(marker, name) for name in _PLACE_IN_PLAN},
+                **self._frame_of_road(),
+            },
         }
+
+    def _frame_of_road(self) -> dict[str, str]:
+        """System and realization in which the road came, for exports: those of the position are WGS 84 / ITRF."""
+        road = self.alignment
+        if not road.crs.startswith("EPSG:"):
+            return {}
+        realization = road.declared_realization
+        return {"crs": road.crs, **({"realization": realization} if realization else {})}
 
     def position(self, marker: PlannedMarker) -> ColumnValues:
         """Columns of a planned marker's position, and its place on the road."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
 import zipfile
@@ -18,9 +19,14 @@ import orjson
 import shapely
 from pyproj import Transformer
 
+from app.errors import InvalidParameter, ReferenceSystemError
+from app.formats.surveys.coordinates import crs_unit
+from app.formats.surveys.declaration import METRES
 from app.formats.text import TableWriter
-from app.geodesy.systems import is_ellipsoidal
-from app.values import JsonObject
+from app.geodesy import reference_system
+from app.geodesy.place import Origin, heights_above, positions_in_system
+from app.geodesy.systems import ELLIPSOID, covers, is_ellipsoidal, is_global
+from app.values import Floats, JsonObject
 
 Record = JsonObject
 
@@ -48,13 +54,104 @@ MAX_FROM_MERIDIAN_DEG = 9.0
 begins in one zone lies in it whole."""
 
 
+FRAME_TEXTS = ("geometry_crs", "geometry_realization", "geometry_vertical_datum")
+FRAME_NUMBERS = ("geometry_epoch",)
+FRAME_FIELDS = (*FRAME_TEXTS, *FRAME_NUMBERS)
+"""What the geometry of a framed record is in; `lon_deg`, `lat_deg` and `height_m` stay those of the registry."""
+SHAPEFILE_NAMES |= {
+    "geometry_crs": "geom_crs", "geometry_realization": "geom_realz", "geometry_vertical_datum": "geom_vdatm",
+    "geometry_epoch": "geom_epoch",
+}  # fmt: skip
+ORIGIN_FIELDS = ("origin_crs", "origin_realization")
+"""System and realization in which a marker, or the road of its plan, came; records that are framed have them."""
+_ORIGIN = (*ORIGIN_FIELDS, "epoch", "vertical_datum")
+_PLACE = ("x", "y", "z_m")
+
+
+class ExportFrame(NamedTuple):
+    """The reference system of an export."""
+
+    crs: str  # ``EPSG:code`` or ``OGC:CRS84``
+    realization: str | None = None  # without, that in which each marker came, where it came in this system
+    epoch: float | None = None  # [decimal year] without, that of each marker
+    # as `normalize_vertical_datum` writes it; without, each height is above its own datum
+    vertical_datum: str | None = None
+    needs_heights: bool = True  # False: a height that cannot be transformed to the vertical datum is left out
+
+
+def frame_records(records: Sequence[Record], frame: ExportFrame) -> tuple[list[Record], ReferenceSystemError | None]:
+    """Records with their place in a reference system, `_PLACE` and `FRAME_FIELDS`, and why some have none.
+
+    A marker outside the system's area, or whose own system has no transformation to it, has no place.
+    """
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for number, record in enumerate(records):
+        unknown = record["transform_accuracy_m"] is None
+        groups.setdefault((*(record[name] for name in _ORIGIN), unknown), []).append(number)
+    framed: list[Record] = [{} for _ in records]
+    problem: ReferenceSystemError | None = None
+    for (crs, realization, epoch, datum, unknown), numbers in groups.items():
+        origin = Origin(crs, not unknown, epoch, is_ellipsoidal(datum), realization)
+        own = [records[number] for number in numbers]
+        place = np.full((3, len(own)), np.nan)
+        try:
+            found = _place_in(own, frame, origin, datum or ELLIPSOID)
+        except ReferenceSystemError as error:
+            problem = problem or error
+        else:
+            place[:] = found
+        is_own = not is_global(reference_system(frame.crs))
+        realization = frame.realization or (realization if is_own else None)
+        stated = (frame.crs, realization, frame.vertical_datum or datum or ELLIPSOID, frame.epoch or epoch)
+        for number, values in zip(numbers, place.T.tolist(), strict=True):
+            coordinates = (None if math.isnan(value) else value for value in values)
+            named = zip((*FRAME_FIELDS, *_PLACE), (*stated, *coordinates), strict=True)
+            framed[number] = {**records[number], **dict(named)}
+    return framed, problem
+
+
+def _place_in(records: Sequence[Record], frame: ExportFrame, origin: Origin, datum: str) -> Floats:
+    """Coordinates and heights, shape (3, N); NaN outside the system's area, and where a height is unknown."""
+    lon, lat = (np.array([record[name] for record in records], np.float64) for name in ("lon_deg", "lat_deg"))
+    height = np.array([np.nan if record["height_m"] is None else record["height_m"] for record in records], np.float64)
+    place = np.full((3, len(records)), np.nan)
+    inside = covers(reference_system(frame.crs).area_of_use, lon, lat)
+    if not inside.any():
+        inside[:] = True  # the error says where the system is used
+    at = (lon[inside], lat[inside])
+    found = positions_in_system(
+        *at, height[inside], frame.crs, origin=origin, realization=frame.realization, epoch=frame.epoch
+    )
+    up = found.height_m
+    try:
+        if np.isfinite(up).any():
+            up = heights_above(*at, up, frame.crs, datum, frame.vertical_datum or datum)
+    except ReferenceSystemError:
+        if frame.needs_heights:
+            raise
+        up = np.full_like(up, np.nan)
+    place[:, inside] = found.first, found.second, up
+    return place
+
+
 class WrittenFile(NamedTuple):
-    """A file, and the ids of the markers that lie too far from its UTM zone."""
+    """A file, and the ids of the markers that lie outside its reference system's area."""
 
     path: Path
     left_out: tuple[str, ...] = ()
 
 
+INSUNITS = {"m": 6, "ft-intl": 2, "ft-us": 21}
+"""Units of drawings. Source: Autodesk DXF reference, "HEADER section group codes"."""
+LANDXML_UNITS = {
+    "m": '<Metric linearUnit="meter" areaUnit="squareMeter" volumeUnit="cubicMeter" temperatureUnit="celsius" '
+    'pressureUnit="milliBars"/>',
+    **{
+        unit: f'<Imperial linearUnit="{name}" areaUnit="squareFoot" volumeUnit="cubicFeet" '
+        'temperatureUnit="fahrenheit" pressureUnit="inchHG"/>'
+        for unit, name in (("ft-intl", "foot"), ("ft-us", "USSurveyFoot"))
+    },
+}
 _DXF_PLACE = (111111.25, 222222.25, 333333.25)
 _DXF_VALUES = (*map(str, _DXF_PLACE), "<CODE>", "<ID>", "<HEIGHT>")
 """What stands in the reference that is repeated, in the place of a marker's position and texts."""
@@ -63,23 +160,28 @@ _GIS_PAGE = 50_000
 
 
 class _Zone(NamedTuple):
-    """Markers in a UTM zone [m], and the ids of the others."""
+    """Markers in a projected system, in its unit, and the ids of the others."""
 
     code: int
     records: list[Record]
     east: npt.NDArray[np.float64]
     north: npt.NDArray[np.float64]
     left_out: tuple[str, ...]
+    unit: str = "m"
+    stated: str = "WGS 84 / ITRF, heights above the ellipsoid"  # what the coordinates are in, for people
 
 
-def write_csv(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
+def write_csv(pages: Iterable[Sequence[Record]], frame: ExportFrame | None = None) -> Iterator[bytes]:
     """CSV (RFC 4180), a page at a time; a text that a spreadsheet would run as a formula gets an apostrophe."""
-    yield (",".join(FIELDS) + "\r\n").encode()
+    texts, numbers = (
+        (TEXTS, NUMBERS) if frame is None else ((*TEXTS, *FRAME_TEXTS), (*NUMBERS, *FRAME_NUMBERS, *_PLACE))
+    )
+    yield (",".join((*texts, *numbers)) + "\r\n").encode()
     for page in pages:
         text = io.StringIO(newline="")
         writer = TableWriter(text)
         for record in page:
-            writer.write_row([*(_text(record[n]) for n in TEXTS), *(_number(record[n]) for n in NUMBERS)])
+            writer.write_row([*(_text(record[n]) for n in texts), *(_number(record[n]) for n in numbers)])
         yield text.getvalue().encode()
 
 
@@ -91,9 +193,13 @@ def _number(value: object) -> str:
     return "" if value is None else repr(value)
 
 
-def write_geojson(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
-    """A FeatureCollection (RFC 7946), a page at a time."""
-    yield b'{"type":"FeatureCollection","features":['
+def write_geojson(pages: Iterable[Sequence[Record]], frame: ExportFrame | None = None) -> Iterator[bytes]:
+    """A FeatureCollection (RFC 7946), a page at a time; in another system with its name, as GeoJSON 2008 has it."""
+    yield b'{"type":"FeatureCollection",'
+    if frame is not None:
+        urn = f"urn:ogc:def:crs:{'OGC::CRS84' if frame.crs == 'OGC:CRS84' else frame.crs.replace(':', '::')}"
+        yield b'"crs":' + orjson.dumps({"type": "name", "properties": {"name": urn}}) + b","
+    yield b'"features":['
     first = True
     for page in pages:
         text = b",".join(orjson.dumps(_feature(record)) for record in page)
@@ -103,11 +209,23 @@ def write_geojson(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
 
 
 def _feature(record: Record) -> dict[str, object]:
-    height_m = _ellipsoidal_m(record)
-    place = [record["lon_deg"], record["lat_deg"], *([] if height_m is None else [height_m])]
-    properties = {name: record[name] for name in FIELDS if name not in ("id", "lon_deg", "lat_deg")}
-    geometry = {"type": "Point", "coordinates": place}
+    x, y, height_m = _place(record)
+    names = [*FIELDS, *(FRAME_FIELDS if _is_framed(record) else ())]
+    properties = {name: record[name] for name in names if name not in ("id", "lon_deg", "lat_deg")}
+    coordinates = [x, y, *([] if height_m is None else [height_m])]
+    geometry = None if x is None else {"type": "Point", "coordinates": coordinates}
     return {"type": "Feature", "id": record["id"], "geometry": geometry, "properties": properties}
+
+
+def _is_framed(record: Record) -> bool:
+    return "geometry_crs" in record
+
+
+def _place(record: Record) -> tuple[float | None, float | None, float | None]:
+    """Coordinates of a record's geometry; heights of those without a frame are ellipsoidal, or there are none."""
+    if _is_framed(record):
+        return record["x"], record["y"], record["z_m"]
+    return record["lon_deg"], record["lat_deg"], _ellipsoidal_m(record)
 
 
 def _ellipsoidal_m(record: Record) -> float | None:
@@ -134,10 +252,10 @@ def write_file(kind: str, pages: Iterable[Sequence[Record]], folder: Path, *, al
             return WrittenFile(path, write(list(chain.from_iterable(pages)), file))
     records = chain.from_iterable(pages)
     first = iter(lambda: list(islice(records, None if kind == "kml" else _GIS_PAGE)), [])
-    return WrittenFile(write_gis(first, kind, folder, all_heights=all_heights))
+    return write_gis(first, kind, folder, all_heights=all_heights)
 
 
-def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, all_heights: bool) -> Path:
+def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, all_heights: bool) -> WrittenFile:
     """A GeoPackage, a zipped Shapefile (names of `SHAPEFILE_NAMES`) or KML in a folder, by GDAL, a page at a time.
 
     Parameters
@@ -155,32 +273,56 @@ def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, a
     from pyogrio import raw  # type: ignore[import-untyped]  # 50 MB that most servers never need
 
     name, suffix = {"gpkg": ("GPKG", "gpkg"), "shapefile": ("ESRI Shapefile", "shp"), "kml": ("KML", "kml")}[driver]
-    names = [SHAPEFILE_NAMES[n] for n in FIELDS] if driver == "shapefile" else list(FIELDS)
-    kind = "Point Z" if all_heights and driver == "shapefile" else "Point"  # GDAL adds z to a GeoPackage's as it comes
-    path = folder / f"markers.{suffix}"
+    path, left_out, written = folder / f"markers.{suffix}", list[str](), 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # KML has a name of its own for some fields
-        for number, page in enumerate(pages):
-            geometry, columns = _gis_columns(page, flat=kind == "Point" and driver != "gpkg")
+        for whole in pages:
+            page = [record for record in whole if _place(record)[0] is not None]
+            left_out += [str(record["id"]) for record in whole if _place(record)[0] is None]
+            if not page:
+                continue
+            is_framed = _is_framed(page[0])
+            texts = (*TEXTS, *FRAME_TEXTS) if is_framed else TEXTS
+            numbers = (*NUMBERS, *FRAME_NUMBERS) if is_framed else NUMBERS
+            crs = page[0]["geometry_crs"] if is_framed else "EPSG:4326"
+            all_heights = all_heights or is_framed  # the z of a Shapefile is NaN where there is none
+            fields = (*texts, *numbers)
+            names = [SHAPEFILE_NAMES[n] for n in fields] if driver == "shapefile" else list(fields)
+            # GDAL adds z to a GeoPackage's geometry as it comes
+            kind = "Point Z" if all_heights and driver == "shapefile" else "Point"
+            geometry, columns = _gis_columns(page, texts, numbers, flat=kind == "Point" and driver != "gpkg")
             raw.write(
-                path, geometry, columns, names, driver=name, geometry_type=kind, crs="EPSG:4326",
-                layer="markers", encoding="UTF-8", append=number > 0,
+                path, geometry, columns, names, driver=name, geometry_type=kind, crs=crs,
+                layer="markers", encoding="UTF-8", append=written > 0,
             )  # fmt: skip
-    return _zipped(folder) if driver == "shapefile" else path
+            written += len(page)
+    if not written:
+        raise _none_in_area()
+    return WrittenFile(_zipped(folder) if driver == "shapefile" else path, tuple(left_out))
 
 
-def _gis_columns(page: Sequence[Record], *, flat: bool) -> tuple[object, list[Any]]:
-    """Points as WKB, and the columns of `FIELDS`."""
+def _none_in_area() -> InvalidParameter:
+    return InvalidParameter(
+        "no marker of the selection has a place in the system of the export",
+        field="crs",
+        limit="a system in whose area they lie",
+        cure="choose another system, or leave crs out",
+    )
+
+
+def _gis_columns(
+    page: Sequence[Record], texts: Sequence[str], numbers: Sequence[str], *, flat: bool
+) -> tuple[object, list[Any]]:
+    """Points as WKB, and the columns."""
     values = list(zip(*(record.values() for record in page), strict=True))
     of = dict(zip(page[0], values, strict=True))
-    columns = [np.array(of[n], dtype=object) for n in TEXTS]
-    columns += [np.array([np.nan if v is None else v for v in of[n]], dtype=np.float64) for n in NUMBERS]
-    lon, lat = (columns[FIELDS.index(n)] for n in ("lon_deg", "lat_deg"))
-    points = shapely.points(lon, lat)
+    columns = [np.array(of[n], dtype=object) for n in texts]
+    columns += [np.array([np.nan if v is None else v for v in of[n]], dtype=np.float64) for n in numbers]
+    x, y, z = np.array([_place(record) for record in page], dtype=np.float64).T
+    points = shapely.points(x, y)
     if not flat:
-        height = np.array([_ellipsoidal_m(record) for record in page], dtype=np.float64)
-        known = np.isfinite(height)
-        points[known] = shapely.points(lon[known], lat[known], height[known])
+        known = np.isfinite(z)
+        points[known] = shapely.points(x[known], y[known], z[known])
     return shapely.to_wkb(points), columns
 
 
@@ -194,21 +336,22 @@ def _zipped(folder: Path) -> Path:
 
 
 def write_landxml(records: Sequence[Record], file: IO[bytes]) -> tuple[str, ...]:
-    """LandXML 1.2 CgPoints (north, east, ellipsoidal height) in the UTM zone of WGS 84 that most markers lie in.
+    """LandXML 1.2 CgPoints (north, east, height) in the system of the records, or in the UTM zone of WGS 84 that most
+    markers lie in, with ellipsoidal heights.
 
     Returns the ids of the markers that lie too far from it.
     """
-    zone = _utm(records)
+    zone = _zone_of(records)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2" version="1.2"><Units><Metric linearUnit="meter" '
-        'areaUnit="squareMeter" volumeUnit="cubicMeter" temperatureUnit="celsius" pressureUnit="milliBars"/></Units>',
-        f'<CoordinateSystem epsgCode="{zone.code}"/><CgPoints>',
+        '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2" version="1.2">'
+        f"<Units>{LANDXML_UNITS[zone.unit]}</Units>",
+        f'<CoordinateSystem epsgCode="{zone.code}" desc={quoteattr(zone.stated)}/><CgPoints>',
     ]
     lines += [f"<!-- left out: {marker_id}, too far from this zone -->" for marker_id in zone.left_out]
     for record, e, n in zip(zone.records, zone.east, zone.north, strict=True):
-        z = _ellipsoidal_m(record)
-        height = f" {z:.4f}" if z is not None else ""
+        z_m = _place(record)[2]
+        height = f" {z_m / METRES[zone.unit]:.4f}" if z_m is not None else ""
         name, description = quoteattr(_code(record)), quoteattr("; ".join([str(record["id"]), *_other_height(record)]))
         lines.append(f"<CgPoint name={name} desc={description}>{n:.4f} {e:.4f}{escape(height)}</CgPoint>")
     file.writelines(f"{line}\n".encode() for line in (*lines, "</CgPoints></LandXML>"))
@@ -216,20 +359,23 @@ def write_landxml(records: Sequence[Record], file: IO[bytes]) -> tuple[str, ...]
 
 
 def write_dxf(records: Sequence[Record], file: IO[bytes]) -> tuple[str, ...]:
-    """DXF R2010 in metres: a block reference a marker with its code and id, in the UTM zone of WGS 84 that most lie in.
+    """DXF R2010: a block reference a marker with its code and id, in the system of the records, or in metres in the UTM
+    zone of WGS 84 that most lie in.
 
-    Its z is the ellipsoidal height; 0, the plane of the drawing, where that is unknown: a block always has one. Another
-    height is the attribute HEIGHT, with its datum. Returns the ids of the markers that lie too far from the zone.
+    Its z is the height in that system; 0, the plane of the drawing, where that is unknown: a block always has one.
+    Another height is the attribute HEIGHT, with its datum. Returns the ids of the markers that lie too far from the
+    zone.
 
     ezdxf writes the drawing with one reference, which is repeated as text for each marker: objects would take 7 kB and
     a millisecond of processor time for each.
     """
     from ezdxf.filemanagement import new
 
-    zone = _utm(records)
+    zone = _zone_of(records)
     layer = f"WAYMARK_EPSG_{zone.code}"
-    document = new("R2010", units=6)
-    document.header["$INSUNITS"] = 6
+    document = new("R2010", units=INSUNITS[zone.unit])
+    document.header["$INSUNITS"] = INSUNITS[zone.unit]
+    document.header.custom_vars.append("COORDINATE_SYSTEM", zone.stated)
     document.layers.add(layer)
     for marker_id in zone.left_out:
         document.header.custom_vars.append("LEFT_OUT", marker_id)
@@ -253,7 +399,8 @@ def write_dxf(records: Sequence[Record], file: IO[bytes]) -> tuple[str, ...]:
     for k, (record, e, n) in enumerate(zip(zone.records, zone.east.tolist(), zone.north.tolist(), strict=True)):
         numbers = (f"{first_handle + step * k + j:X}" for j in range(step))
         texts = (_code(record), str(record["id"]), "".join(_other_height(record)))
-        values = (*numbers, e, n, _ellipsoidal_m(record) or 0.0, *map(_one_line, texts))
+        up = (_place(record)[2] or 0.0) / METRES[zone.unit]
+        values = (*numbers, e, n, up, *map(_one_line, texts))
         file.write(template.format(*values).encode())
     file.write((_DXF_SECTION_END + after).encode())
     return zone.left_out
@@ -269,8 +416,36 @@ def _code(record: Record) -> str:
 
 def _other_height(record: Record) -> list[str]:
     """A height that is not in the geometry, in words."""
-    known = record["height_m"] is not None and _ellipsoidal_m(record) is None
+    known = record["height_m"] is not None and _place(record)[2] is None
     return [f"{record['height_m']:.4f} m above {record['vertical_datum']}"] if known else []
+
+
+def _zone_of(records: Sequence[Record]) -> _Zone:
+    """The system of the records, or the UTM zone that most lie in."""
+    if not _is_framed(records[0]):
+        return _utm(records)
+    system = reference_system(records[0]["geometry_crs"])
+    if not system.is_projected:
+        raise InvalidParameter(
+            f"{records[0]['geometry_crs']} is geographic, and LandXML and DXF take eastings and northings",
+            field="crs",
+            limit="a projected system",
+            cure="choose a projected system, or leave crs out",
+        )
+    kept = [record for record in records if record["x"] is not None]
+    if not kept:
+        raise _none_in_area()
+    east, north = (np.array([record[name] for record in kept], np.float64) for name in ("x", "y"))
+    left_out = tuple(str(record["id"]) for record in records if record["x"] is None)
+    frames = dict.fromkeys(_frame_in_words(record) for record in kept)
+    code = int(records[0]["geometry_crs"].partition(":")[2])
+    return _Zone(code, kept, east, north, left_out, crs_unit(system), f"{system.name}: {' / '.join(list(frames)[:3])}")
+
+
+def _frame_in_words(record: Record) -> str:
+    realization, epoch = record["geometry_realization"], record["geometry_epoch"]
+    parts = [realization or "realization not stated", f"epoch {epoch:g}" if epoch else "epoch not stated"]
+    return ", ".join([*parts, f"heights above {record['geometry_vertical_datum']}"])
 
 
 def _utm(records: Sequence[Record]) -> _Zone:

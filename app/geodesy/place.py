@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from pyproj import CRS, Transformer
+from pyproj.crs import CompoundCRS
 from pyproj.enums import TransformDirection
+from pyproj.transformer import TransformerGroup
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.geodesy.frames import check_lon_lat
-from app.geodesy.operations import BoundedOperation, list_operations, plate_motion
+from app.geodesy.operations import BoundedOperation, list_operations, move_to_epoch, plate_motion
 from app.geodesy.systems import (
+    ELLIPSOID,
     TARGET,
     accuracy_of_global,
     best_effort,
@@ -413,7 +419,14 @@ class SystemPositions:
 
 
 def positions_in_system(
-    lon_deg: Floats, lat_deg: Floats, height_m: Floats, crs: str, *, origin: Origin
+    lon_deg: Floats,
+    lat_deg: Floats,
+    height_m: Floats,
+    crs: str,
+    *,
+    origin: Origin,
+    realization: str | None = None,
+    epoch: float | None = None,
 ) -> SystemPositions:
     """Transform positions in WGS 84 / ITRF to a reference system.
 
@@ -423,11 +436,16 @@ def positions_in_system(
         Height is NaN where unknown.
     crs : str
         Of the result, in any form of `normalize_crs`.
+    realization : str, optional
+        Of that system. Without, the one in which the positions came, if they came in this system.
+    epoch : float, optional
+        Of the result; without, that of the positions. [decimal year]
 
     Raises
     ------
     ReferenceSystemError
-        The system is unknown, not made for this place, or has no transformation with a stated accuracy.
+        The system is unknown, not made for this place, has no such realization, or has no transformation with a stated
+        accuracy; or positions without an epoch are to be moved to one.
 
     Notes
     -----
@@ -445,15 +463,100 @@ def positions_in_system(
             limit=f"west, south, east, north: {', '.join(f'{v:g}' for v in area.bounds)} deg" if area else None,
             cure="choose a system of this place",
         )
+    _check_realization(name, realization)
+    if epoch is not None and epoch != origin.epoch:
+        lon_deg, lat_deg, origin = _at_epoch(lon_deg, lat_deg, epoch, origin)
     if is_global(system):
         first, second = _projected(name, lon_deg, lat_deg)
         return SystemPositions(first, second, height_m, 0.0, f"{name} is on a global datum: no datum transformation")
-    returns = _same_datum(name, origin.crs)
+    returns = _same_datum(name, origin.crs) and realization in (None, origin.realization)
+    origin = origin if returns else replace(origin, realization=realization)
     if returns and not origin.stated:
-        first, second = best_effort(name).transform(lon_deg, lat_deg, direction=_INVERSE)
+        first, second, *_ = _undone(best_effort(name), lon_deg, lat_deg)
         note = f"the road came in {origin.crs} without a stated accuracy, which is undone: exact in its own datum"
         return SystemPositions(np.asarray(first), np.asarray(second), height_m, 0.0, note)
     return _transformed(name, lon_deg, lat_deg, height_m, origin, returns)
+
+
+def _check_realization(name: str, realization: str | None) -> None:
+    system = named_system(name)
+    is_known = accuracy_of_global(realization) if is_global(system) else system_of_realization(name, realization)
+    if realization is not None and is_known is None:
+        raise ReferenceSystemError(
+            f"{realization[:40]!r} is not a realization of {name} ({system.name})",
+            field="realization",
+            limit="a realization of the system in the EPSG registry, such as ETRF2000 of ETRS89",
+            cure="correct it, or leave it out",
+        )
+
+
+def _at_epoch(lon_deg: Floats, lat_deg: Floats, epoch: float, origin: Origin) -> tuple[Floats, Floats, Origin]:
+    if origin.epoch is None:
+        raise ReferenceSystemError(
+            "the epoch of the positions is not known, so that they cannot be moved to another one",
+            field="epoch",
+            limit="positions with an epoch",
+            cure="leave the epoch out, or state that of the positions in the registry",
+        )
+    moved = move_to_epoch(lon_deg, lat_deg, origin.epoch, epoch)
+    return moved.lon_deg, moved.lat_deg, replace(origin, epoch=epoch)
+
+
+def heights_above(
+    lon_deg: Floats, lat_deg: Floats, height_m: Floats, crs: str, from_datum: str, to_datum: str
+) -> Floats:
+    """Heights above another datum.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg : ndarray, shape (N,)
+        [deg]
+    height_m : ndarray, shape (N,)
+        NaN where unknown. [m]
+    crs : str
+        On whose ellipsoid ellipsoidal heights are.
+    from_datum, to_datum : str
+        As `normalize_vertical_datum` writes them.
+
+    Raises
+    ------
+    ReferenceSystemError
+        There is no transformation with a stated accuracy, or its grid is not installed: the message names it.
+    """
+    if from_datum == to_datum:
+        return height_m
+    base = named_system(normalize_crs(crs)).geodetic_crs
+    assert base is not None
+    for datum, direction in ((from_datum, TransformDirection.INVERSE), (to_datum, TransformDirection.FORWARD)):
+        if datum != ELLIPSOID:
+            transformer = _height_transformer(base.to_wkt(), datum)
+            height_m = np.asarray(transformer.transform(lon_deg, lat_deg, height_m, direction=direction)[2])
+            height_m = np.where(np.isfinite(height_m), height_m, np.nan)
+    return height_m
+
+
+@lru_cache(maxsize=64)
+def _height_transformer(base_wkt: str, datum: str) -> Transformer:
+    """From ellipsoidal heights to heights above a datum."""
+    base, vertical = CRS.from_wkt(base_wkt), CRS.from_user_input(datum)
+    target = CompoundCRS("heights", [base.to_2d(), vertical])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # missing grids are named below
+        group = TransformerGroup(base.to_3d(), target, always_xy=True, allow_ballpark=False)
+    stated = [one for one in group.transformers if one.accuracy >= 0]
+    if stated:
+        return min(stated, key=lambda one: one.accuracy)
+    grids = dict.fromkeys(g.short_name for one in group.unavailable_operations for g in one.grids if not g.available)
+    names = " or ".join(list(grids)[:4])
+    raise ReferenceSystemError(
+        f"heights above {datum} ({vertical.name}) "
+        + (f"need the grid {names}, which is not installed" if grids else f"are not related to {base.name} in PROJ"),
+        field="vertical_datum",
+        limit="ellipsoid, or a datum with its grid",
+        cure=f"projsync --file {next(iter(grids))} --target-dir $WAYMARK_PROJ_GRIDS_DIR, and restart the server"
+        if grids
+        else "ask for the datum of the heights in the registry",
+    )
 
 
 def _transformed(
@@ -463,7 +566,7 @@ def _transformed(
     three_d = origin.ellipsoidal_height and bool(np.isfinite(height_m).all())
     middle = int(np.argsort(lon_deg)[len(lon_deg) // 2])
     place = float(lon_deg[middle]), float(lat_deg[middle])
-    source = (system_of_realization(name, origin.realization) if returns else None) or name
+    source = system_of_realization(name, origin.realization) or name
     operations = list_operations(source, *place, three_d=three_d, accuracy_m=np.inf)
     if not isinstance(operations, str) and origin.epoch is None:
         known = [operation for operation in operations if not operation.needs_epoch]
@@ -478,7 +581,7 @@ def _transformed(
     heights = np.where(np.isfinite(height_m), height_m, 0.0) if three_d else np.zeros_like(lon_deg)
     epochs = np.full_like(lon_deg, origin.epoch or 0.0)
     for operation in operations:
-        x, y, z, _ = operation.transformer.transform(lon_deg, lat_deg, heights, epochs, direction=_INVERSE)
+        x, y, z = _undone(operation.transformer, lon_deg, lat_deg, heights, epochs)
         if np.isfinite(x).all() and np.isfinite(y).all():
             first, second = _projected(name, np.asarray(x), np.asarray(y))
             up = np.asarray(z) if three_d else height_m
@@ -492,6 +595,20 @@ def _transformed(
         limit="a transformation that covers the road",
         cure="choose another system",
     )
+
+
+def _undone(transformer: Transformer, lon_deg: Floats, lat_deg: Floats, *more: Floats) -> tuple[Floats, ...]:
+    """What a transformer turns into these positions: longitude, latitude, and the height where one comes in.
+
+    PROJ's own inverse of a transformation without heights is off by a millimetre, because the height that such a
+    transformation gives is dropped. The rest after one step back and forth is below a micrometre.
+    """
+    start = transformer.transform(lon_deg, lat_deg, *more, direction=_INVERSE)
+    again = transformer.transform(*start)
+    aim = [
+        2 * np.asarray(goal) - np.asarray(met) for goal, met in zip((lon_deg, lat_deg, *more[:1]), again, strict=False)
+    ]
+    return tuple(np.asarray(v) for v in transformer.transform(*aim, *more[1:], direction=_INVERSE)[:3])
 
 
 def _projected(name: str, lon_deg: Floats, lat_deg: Floats) -> tuple[Floats, Floats]:

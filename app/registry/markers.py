@@ -571,14 +571,34 @@ def list_records(
     after: str | None,
     limit: int,
 ) -> list[JsonObject]:
-    """Markers in the order of their ids as flat records of these fields: columns, `code`, and `side` of CERPMs."""
-    own = {"code": markers.c.digits, "side": markers.c.spec["side"].as_string()}
+    """Markers in the order of their ids as flat records of these fields: columns, `code`, `side` of CERPMs, and
+    `origin_crs` and `origin_realization`, in which a marker, or the road of its plan, came."""
+    own = {
+        "code": markers.c.digits,
+        "side": markers.c.spec["side"].as_string(),
+        "origin_crs": _origin_crs(),
+        "origin_realization": sa.func.coalesce(
+            markers.c.original[("plan", "realization")].as_string(), markers.c.original["realization"].as_string()
+        ),
+    }
     columns = [own[name].label(name) if name in own else markers.c[name] for name in fields]
     query = sa.select(*columns).where(markers.c.agency_id == agency_id, *conditions_of(filtered))
     if after is not None:
         query = query.where(markers.c.id > after)
     rows = connection.execute(query.order_by(markers.c.id).limit(limit)).all()
     return [dict(zip(fields, row, strict=True)) for row in rows]
+
+
+def _origin_crs() -> sa.ColumnElement[str]:
+    return sa.func.coalesce(markers.c.original[("plan", "crs")].as_string(), markers.c.crs)
+
+
+def origins(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> list[tuple[str, str | None]]:
+    """Systems and vertical datums in which markers, or the roads of their plans, came; the most frequent first."""
+    crs = _origin_crs()
+    query = sa.select(crs, markers.c.vertical_datum).where(markers.c.agency_id == agency_id, *conditions_of(filtered))
+    query = query.group_by(crs, markers.c.vertical_datum).order_by(sa.func.count().desc(), crs).limit(100)
+    return [(str(name), datum) for name, datum in connection.execute(query)]
 
 
 def count_records(

@@ -31,7 +31,7 @@ from app.api.jobs import queued_job
 from app.api.plans.alignments import Name
 from app.formats.surveys.declaration import Unit
 from app.inputs import Flag, Identifier, StrictModel, Text
-from app.planning.outputs.package import MEDIA_TYPES, PackageOptions
+from app.planning.outputs.package import MEDIA_TYPES, OutputOptions, PackageOptions
 from app.planning.proof import ProofReport, ProofTerms
 from app.planning.radio_checks import RadioCheck, RadioPlan, check_radio
 from app.planning.rules import read_rules, rules_schema
@@ -291,6 +291,12 @@ def get_plan_file(
     proofs: Annotated[Proofs, use_case(lambda cases: cases.proofs)],
     crs: Annotated[Text | None, Query(max_length=64, description="CRS of the stakeout.")] = None,
     unit: Annotated[Unit | None, Query(description="Unit of the stakeout.")] = None,
+    realization: Annotated[
+        Text | None, Query(max_length=64, description="Realization of that CRS; that of the road if left out.")
+    ] = None,
+    epoch: Annotated[
+        float | None, Query(ge=1950, le=2200, allow_inf_nan=False, description="That of the road if left out.")
+    ] = None,
 ) -> Response:
     """Download a file of a plan.
 
@@ -302,7 +308,7 @@ def get_plan_file(
         data, row = proofs.file(caller, plan_id, name)
         version = row.version
     else:
-        data, version = plans.file(caller, plan_id, name, crs=crs, unit=unit)
+        data, version = plans.file(caller, plan_id, name, OutputOptions(crs, unit, realization, epoch))
     media_type = MEDIA_TYPES.get(name.rpartition(".")[2], "application/octet-stream")
     headers = {"ETag": f'"{version}-{name}"', "Content-Disposition": f'attachment; filename="{name}"'}
     return Response(data, media_type=media_type, headers=headers)

@@ -31,7 +31,7 @@ from app.encoders.plate.face import reference_text
 from app.errors import InvalidParameter, NotFound
 from app.formats.surveys.declaration import Unit
 from app.geodesy import UNFIT_TEXT, LocalizationGrade
-from app.inputs import INPUT, Flag, Text, Whole
+from app.inputs import INPUT, Flag, Number, Text, Whole
 from app.markers.magnet import LineStyle
 from app.planning.magnet_checks import Site, drilling_sheet
 from app.planning.magnet_stretches import even_stretches, lane_around, spacing_of
@@ -47,7 +47,7 @@ from app.planning.outputs.plan_document import (
     write_plan_programs_csv,
     write_plan_programs_json,
 )
-from app.planning.outputs.stakeout import StakeoutFormat, plan_stakeout, write_stakeout
+from app.planning.outputs.stakeout import Stakeout, StakeoutFormat, plan_stakeout, write_stakeout
 from app.planning.outputs.strip_map import Drawings
 from app.planning.plan import Optimum, Plan, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag, TradeOffPoint
 from app.roads.lane_line import LaneLine
@@ -66,10 +66,20 @@ class OutputOptions:
 
     crs: Annotated[Text | None, Field(max_length=64, description="Projected CRS of the stakeout.")] = None
     unit: Annotated[Unit | None, Field(description="Of the stakeout.")] = None
+    realization: Annotated[
+        Text | None, Field(max_length=64, description="Of that CRS; that of the road if left out.")
+    ] = None
+    epoch: Annotated[
+        Number | None, Field(ge=1950, le=2200, description="Of the stakeout; that of the road if left out.")
+    ] = None
     scale: Annotated[
         Whole | None, Field(ge=1, le=100_000, description="Of the drawings: 250, 500, 1000, 2000 or 5000.")
     ] = None
     title_block: TitleBlock = field(default_factory=TitleBlock)
+
+    def stakeout(self, plan: Plan) -> Stakeout:
+        """The stakeout of a plan; raises as `plan_stakeout`."""
+        return plan_stakeout(plan, self.crs, self.unit, self.realization, self.epoch)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +139,7 @@ def plan_files(
         The options do not fit the plan; raised before the first file.
     """
     options = options or OutputOptions()
-    stakeout = plan_stakeout(plan, options.crs, options.unit) if plan.markers else None
+    stakeout = options.stakeout(plan) if plan.markers else None
     drawings = Drawings(plan, options.title_block, options.scale) if plan.markers else None
     yield OutputFile("plan.json", lambda: write_plan(plan))
     yield OutputFile("plan.geojson", lambda: write_plan_geojson(plan))
@@ -248,7 +258,7 @@ class Package:
         if self.plan.markers:
             options = self.options
             try:
-                plan_stakeout(replace(self.plan, markers=self.plan.markers[:1]), options.crs, options.unit)
+                options.stakeout(replace(self.plan, markers=self.plan.markers[:1]))
             except InvalidParameter as error:
                 error.field = (error.field or "crs").removeprefix("position.")
                 raise

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -18,6 +19,7 @@ import shapely
 from pyproj import Geod
 
 from app.errors import InvalidParameter
+from app.formats.exports import INSUNITS, LANDXML_UNITS
 from app.formats.surveys.coordinates import crs_unit
 from app.formats.surveys.declaration import METRES
 from app.geodesy import normalize_crs, reference_system
@@ -84,7 +86,13 @@ class Stakeout:
     points: tuple[StakePoint, ...]
 
 
-def plan_stakeout(plan: Plan, crs: str | None = None, unit: str | None = None) -> Stakeout:
+def plan_stakeout(
+    plan: Plan,
+    crs: str | None = None,
+    unit: str | None = None,
+    realization: str | None = None,
+    epoch: float | None = None,
+) -> Stakeout:
     """Points of a plan in the crew's reference system and unit.
 
     Parameters
@@ -93,6 +101,8 @@ def plan_stakeout(plan: Plan, crs: str | None = None, unit: str | None = None) -
         A projected system; without, that of the road, or the UTM zone of WGS 84 that it lies in.
     unit : str, optional
         ``m``, ``ft-intl`` or ``ft-us``; without, the unit of the system.
+    realization, epoch : optional
+        As for `positions_in_system`.
 
     Raises
     ------
@@ -128,11 +138,12 @@ def plan_stakeout(plan: Plan, crs: str | None = None, unit: str | None = None) -
         road.vertical_datum == "ellipsoid",
         road.declared_realization,
     )
-    found = positions_in_system(lon, lat, height, name, origin=origin)
+    frame = partial(positions_in_system, crs=name, origin=origin, realization=realization, epoch=epoch)
+    found = frame(lon, lat, height)
     scale, up = METRES[own] / METRES[unit], 1.0 / METRES[unit]
     east, north, high = (found.first * scale).tolist(), (found.second * scale).tolist(), (found.height_m * up).tolist()
     bearings = np.array([np.nan if place[6] is None else place[6] for place in places])
-    grid = _grid_bearings(lon, lat, height, bearings, found, name, origin).tolist()
+    grid = _grid_bearings(lon, lat, height, bearings, found, frame).tolist()
     points = tuple(
         StakePoint(
             point, kind, marker, lon_deg, lat_deg, east[k], north[k], high[k] if math.isfinite(high[k]) else None,
@@ -144,14 +155,15 @@ def plan_stakeout(plan: Plan, crs: str | None = None, unit: str | None = None) -
 
 
 def _grid_bearings(
-    lon: Floats, lat: Floats, height: Floats, bearings: Floats, found: SystemPositions, name: str, origin: Origin
-) -> Floats:
+    lon: Floats, lat: Floats, height: Floats, bearings: Floats, found: SystemPositions,
+    frame: Callable[[Floats, Floats, Floats], SystemPositions],
+) -> Floats:  # fmt: skip
     """Bearings from grid north of bearings from true north, shape (N,); NaN stays. [deg]"""
     grid = np.full(len(lon), np.nan)
     k = np.flatnonzero(np.isfinite(bearings))
     if len(k):
         ahead_lon, ahead_lat, _ = _GEOD.fwd(lon[k], lat[k], bearings[k], np.full(len(k), _AHEAD_M))
-        ahead = positions_in_system(np.asarray(ahead_lon), np.asarray(ahead_lat), height[k], name, origin=origin)
+        ahead = frame(np.asarray(ahead_lon), np.asarray(ahead_lat), height[k])
         grid[k] = np.degrees(np.arctan2(ahead.first - found.first[k], ahead.second - found.second[k])) % 360.0
     return grid
 
@@ -226,7 +238,6 @@ def _default_system(plan: Plan) -> str:
 # === Stakeout files for a crew's receiver, total station, CAD and GIS. The same stakeout always gives the same bytes.
 
 
-_INSUNITS = {"m": 6, "ft-intl": 2, "ft-us": 21}  # source: Autodesk DXF reference, "HEADER section group codes"
 _COLOURS = {"plate": 5, "line": 2, "tag": 1, "cerpm": 3}  # ACI of the layers: blue, yellow, red, green
 _TEXT_HEIGHT_M = 0.5  # of labels in CAD; 1 mm at 1 : 500
 _STAMP = "2000-01-01T00:00:00.000Z"  # of GeoPackages, so that the same plan gives the same bytes
@@ -280,19 +291,11 @@ def _delimited(stakeout: Stakeout, *, northing_first: bool) -> bytes:
 
 def _landxml(stakeout: Stakeout) -> bytes:
     """LandXML 1.2 with CgPoints in groups by family: northing, easting, elevation."""
-    unit = {
-        "m": '<Metric linearUnit="meter" areaUnit="squareMeter" volumeUnit="cubicMeter" temperatureUnit="celsius" '
-        'pressureUnit="milliBars"/>',
-        "ft-intl": '<Imperial linearUnit="foot" areaUnit="squareFoot" volumeUnit="cubicFeet" '
-        'temperatureUnit="fahrenheit" pressureUnit="inchHG"/>',
-        "ft-us": '<Imperial linearUnit="USSurveyFoot" areaUnit="squareFoot" volumeUnit="cubicFeet" '
-        'temperatureUnit="fahrenheit" pressureUnit="inchHG"/>',
-    }[stakeout.unit]
     code = stakeout.crs.partition(":")[2]
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2" version="1.2" date="2000-01-01" time="00:00:00">',
-        f"<Units>{unit}</Units>",
+        f"<Units>{LANDXML_UNITS[stakeout.unit]}</Units>",
         f"<CoordinateSystem epsgCode={quoteattr(code)} desc={_attribute(stakeout.crs_name)}/>",
         f"<Project name={_attribute(stakeout.plan.name)} desc={_attribute(stakeout.note)}/>",
         '<Application name="Waymark"/>',
@@ -324,8 +327,8 @@ def _dxf(stakeout: Stakeout) -> bytes:
     """
     from ezdxf.filemanagement import new
 
-    document = new("R2010", units=_INSUNITS[stakeout.unit])
-    document.header["$INSUNITS"] = _INSUNITS[stakeout.unit]
+    document = new("R2010", units=INSUNITS[stakeout.unit])
+    document.header["$INSUNITS"] = INSUNITS[stakeout.unit]
     document.header["$MEASUREMENT"] = int(stakeout.unit == "m")
     document.header["$PDMODE"], document.header["$PDSIZE"] = 34, -1.0  # a cross in a circle, 1 % of the view
     height = _TEXT_HEIGHT_M / METRES[stakeout.unit]

@@ -15,9 +15,9 @@ from app.errors import CodeTaken, Conflict, InvalidParameter
 from app.families import FAMILIES
 from app.families.family import Family
 from app.families.surveys import PLANNED, Commitment, MarkerRules, PlannedRow
-from app.formats.surveys.declaration import Unit
 from app.markers.magnet_design import Codebook
 from app.markers.reading import MarkerRow
+from app.planning.outputs.package import OutputOptions
 from app.planning.outputs.plan_document import read_plan
 from app.planning.plan import Plan, PlannedMarker, PlannedTag
 from app.planning.plan_checks import ExistingMarker
@@ -299,21 +299,19 @@ class Plans:
             document = answer.store(CommittedPlan(**plan_document(committed), markers=markers, uncommitted=uncommitted))
         return document, False
 
-    def file(
-        self, caller: Caller, plan_id: str, name: str, *, crs: str | None = None, unit: Unit | None = None
-    ) -> tuple[bytes, int]:
-        """A file of a plan, and the plan's version; CRS and unit are those of the crew that stakes it out.
+    def file(self, caller: Caller, plan_id: str, name: str, options: OutputOptions | None = None) -> tuple[bytes, int]:
+        """A file of a plan, and the plan's version; the options are those of the crew that stakes it out.
 
         Raises
         ------
         NotFound
             There is no such plan, or it has no such file.
         InvalidParameter, ReferenceSystemError
-            The CRS or the unit cannot be used.
+            The options cannot be used.
         """
         row = self._get(caller, plan_id)
         document = self._blobs.get(row.document_key)
-        content = self._processes.run(write_file_of_plan, document, name, crs, unit, wait_s=BUSY_WAIT_S)
+        content = self._processes.run(write_file_of_plan, document, name, options, wait_s=BUSY_WAIT_S)
         return content, row.version
 
     def as_built(self, caller: Caller, plan_id: str) -> AsBuiltDocument:

@@ -17,7 +17,6 @@ from app.families import get_family, rows_of_plan
 from app.formats.alignments.geometry import AlignmentFile
 from app.formats.alignments.read import read_alignment
 from app.formats.format import SpooledFile
-from app.formats.surveys.declaration import Unit
 from app.geodesy.systems import is_ellipsoidal
 from app.markers.magnet_design import Codebook
 from app.markers.plate import PlateGeometry
@@ -391,9 +390,9 @@ def make_plan(
 
 
 @decoder_task(*_PLAN)
-def write_file_of_plan(document: bytes, name: str, crs: str | None = None, unit: Unit | None = None) -> bytes:
-    """Write a file of a plan; CRS and unit are those of the stakeout."""
-    return write_plan_file(_plan(document), name, OutputOptions(crs, unit), draw_trade_off)
+def write_file_of_plan(document: bytes, name: str, options: OutputOptions | None = None) -> bytes:
+    """Write a file of a plan."""
+    return write_plan_file(_plan(document), name, options or OutputOptions(), draw_trade_off)
 
 
 @decoder_task(*_PLAN)

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import timedelta
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Protocol
 
-from app.errors import InvalidParameter
+from app.errors import InvalidParameter, ReferenceSystemError
 from app.families.surveys import RETIRED
 from app.formats import exports as write
-from app.formats.exports import WrittenFile
+from app.formats.exports import ExportFrame, WrittenFile
+from app.geodesy import normalize_crs, reference_system
+from app.geodesy.systems import normalize_vertical_datum
 from app.registry import jobs as store
 from app.registry import markers
 from app.registry.column_types import new_id
@@ -64,22 +67,32 @@ class Exports:
     def __init__(self, database: Database, write: FileWriter = write.write_file) -> None:
         self._database, self._write = database, write
 
-    def stream(self, caller: Caller, kind: str, filtered: MarkerFilter) -> Iterator[bytes]:
-        """CSV or GeoJSON in the order of the ids, at flat memory."""
-        pages = self._pages(caller, filtered)
-        return write.write_csv(pages) if kind == "csv" else write.write_geojson(pages)
+    def stream(
+        self, caller: Caller, kind: str, filtered: MarkerFilter, frame: ExportFrame | None = None
+    ) -> Iterator[bytes]:
+        """CSV or GeoJSON in the order of the ids, at flat memory.
 
-    def whole(self, caller: Caller, kind: str, filtered: MarkerFilter) -> tuple[Iterator[bytes], tuple[str, ...]]:
+        Raises
+        ------
+        ReferenceSystemError
+            No marker of the first page has a place in the system.
+        """
+        pages = self._pages(caller, filtered, frame)
+        return write.write_csv(pages, frame) if kind == "csv" else write.write_geojson(pages, frame)
+
+    def whole(
+        self, caller: Caller, kind: str, filtered: MarkerFilter, frame: ExportFrame | None = None
+    ) -> tuple[Iterator[bytes], tuple[str, ...]]:
         """One file, written before this returns and gone when it has been read; and the ids of markers left out of it.
 
         Raises
         ------
         InvalidParameter
-            There are none, or too many for one file.
+            There are none, or too many for one file, or none has a place in the system.
         """
         folder = TemporaryDirectory(prefix="waymark-export-")
         try:
-            path, left_out = self.write_file(caller, kind, filtered, Path(folder.name))
+            path, left_out = self.write_file(caller, kind, filtered, Path(folder.name), frame=frame)
         except BaseException:
             folder.cleanup()
             raise
@@ -87,25 +100,32 @@ class Exports:
 
     def write_file(
         self, caller: Caller, kind: str, filtered: MarkerFilter, folder: Path,
-        report: Callable[[int], None] = lambda _markers: None,
+        report: Callable[[int], None] = lambda _markers: None, *, frame: ExportFrame | None = None,
     ) -> WrittenFile:  # fmt: skip
         """One file of any kind, in an empty folder, and the ids of markers left out of it; raises as `whole`.
 
         `report` is called with the number of markers that were read so far; what it raises stops the export.
 
-        LandXML and DXF have one UTM zone: markers too far from it are left out. They have no status either, so retired
-        markers are in them only if the filter asks for these.
+        LandXML and DXF have one projected system: without a frame, that in which most of the markers came, or else the
+        UTM zone that most lie in. Markers too far from it are left out. They have no status either, so retired markers
+        are in them only if the filter asks for these.
         """
         if kind in STREAMED:
             path = folder / f"markers.{kind}"
             with path.open("wb") as file:
-                pages = _reported(self._pages(caller, filtered), report)
-                file.writelines(write.write_csv(pages) if kind == "csv" else write.write_geojson(pages))
+                pages = _reported(self._pages(caller, filtered, frame), report)
+                file.writelines(write.write_csv(pages, frame) if kind == "csv" else write.write_geojson(pages, frame))
             return WrittenFile(path)
         with_retired = kind not in ("landxml", "dxf") or filtered.status is not None
         with self._database.read() as connection:
             count = markers.count_records(connection, caller.agency_id, filtered, with_retired=with_retired)
             all_heights = markers.have_ellipsoidal_heights(connection, caller.agency_id, filtered)
+            if kind in ("landxml", "dxf") and frame is None:
+                frame = _own_frame(markers.origins(connection, caller.agency_id, filtered))
+        if kind == "kml" and frame is not None and frame.crs not in ("EPSG:4326", "OGC:CRS84"):
+            raise InvalidParameter(
+                f"KML is in WGS 84, not in {frame.crs}", field="crs", limit="EPSG:4326", cure="choose another format"
+            )
         if not count:
             raise InvalidParameter(
                 "no marker is in the selection", field="bbox", limit="one at least", cure="widen the filter"
@@ -117,19 +137,39 @@ class Exports:
                 limit=f"{MAX_WHOLE[kind]} markers",
                 cure="export a smaller box, or CSV or GeoJSON",
             )
-        pages = _reported(self._pages(caller, filtered, with_retired=with_retired), report)
+        pages = _reported(self._pages(caller, filtered, frame, with_retired=with_retired), report)
         return self._write(kind, pages, folder, all_heights=all_heights)
 
     def _pages(
-        self, caller: Caller, filtered: MarkerFilter, *, with_retired: bool = True
+        self, caller: Caller, filtered: MarkerFilter, frame: ExportFrame | None, *, with_retired: bool = True
+    ) -> Iterator[list[JsonObject]]:
+        """Pages of records, framed where a frame is wanted; the first one is read at once, so that it can be refused.
+
+        Raises
+        ------
+        ReferenceSystemError
+            No marker of the first page has a place in the frame.
+        """
+        pages = self._read_pages(caller, filtered, frame is not None, with_retired=with_retired)
+        if frame is None:
+            return pages
+        first = next(pages, None)
+        if first is None:
+            return iter(())
+        framed, problem = write.frame_records(first, frame)
+        if problem is not None and all(record["x"] is None for record in framed):
+            raise problem
+        return chain([framed], (write.frame_records(page, frame)[0] for page in pages))
+
+    def _read_pages(
+        self, caller: Caller, filtered: MarkerFilter, with_origin: bool, *, with_retired: bool
     ) -> Iterator[list[JsonObject]]:
         after: str | None = None
+        fields = (*write.FIELDS, *write.ORIGIN_FIELDS) if with_origin else write.FIELDS
         while True:
             check_deadline()
             with self._database.read() as connection:
-                page = markers.list_records(
-                    connection, caller.agency_id, filtered, write.FIELDS, after=after, limit=_PAGE
-                )
+                page = markers.list_records(connection, caller.agency_id, filtered, fields, after=after, limit=_PAGE)
             if not page:
                 return
             after = page[-1]["id"]
@@ -137,7 +177,21 @@ class Exports:
                 page = [record for record in page if record["status"] != RETIRED]
             for record in page:
                 record["updated_at"] = record["updated_at"].isoformat()
-            yield page
+            if page:
+                yield page
+
+
+def _own_frame(origins: Sequence[tuple[str, str | None]]) -> ExportFrame | None:
+    """The projected system in which most markers came, with the vertical datum of most heights in it."""
+    for crs, _datum in origins:
+        try:
+            if not reference_system(crs).is_projected:
+                continue
+        except ReferenceSystemError:
+            continue
+        datum = next((datum for name, datum in origins if name == crs and datum is not None), None)
+        return ExportFrame(crs, vertical_datum=datum, needs_heights=False)
+    return None
 
 
 def _reported(pages: Iterator[list[JsonObject]], report: Callable[[int], None]) -> Iterator[list[JsonObject]]:
@@ -186,9 +240,10 @@ class ExportJobs:
         Parameters
         ----------
         wanted : mapping
-            ``format`` and what `filter_of` reads.
+            ``format`` and what `filter_of` and `frame_of` read.
         """
         filter_of(wanted)
+        frame_of(wanted)
         now, agency_id = self._clock(), caller.agency_id
         job_input = {"wanted": dict(wanted), "label": caller.label}
         job = new_job(JobKind.EXPORT, new_id(now), agency_id, caller.key_id, now, job_input=job_input)
@@ -203,7 +258,7 @@ class ExportJobs:
     def run(self, job: RunningJob) -> None:
         """Write the file; the handler of jobs of the kind `JobKind.EXPORT`."""
         wanted = job.row.input["wanted"]
-        kind, filtered = wanted["format"], filter_of(wanted)
+        kind, filtered, frame = wanted["format"], filter_of(wanted), frame_of(wanted)
         caller = Caller(job.row.agency_id, job.row.holder_id or "", job.row.input["label"], Scope.VIEWER)
         with self._database.read() as connection:
             total = count_records(connection, caller.agency_id, filtered)
@@ -213,7 +268,7 @@ class ExportJobs:
             job.report_progress(min(1.0, done / max(1, total)) * _WRITING, steps=(min(done, total), total))
 
         with TemporaryDirectory(prefix="waymark-export-") as folder:
-            path, left_out = self._exports.write_file(caller, kind, filtered, Path(folder), report)
+            path, left_out = self._exports.write_file(caller, kind, filtered, Path(folder), report, frame=frame)
             headers = {}
             if left_out:
                 headers["Waymark-Left-Out"] = f"{len(left_out)}; {' '.join(left_out[:MAX_LEFT_OUT_IDS])}"
@@ -243,3 +298,24 @@ def filter_of(wanted: JsonObject) -> MarkerFilter:
         box=Box(*box) if box is not None else None,
         area=area_of_text(polygon) if polygon is not None else None,
     )
+
+
+def frame_of(wanted: JsonObject) -> ExportFrame | None:
+    """The reference system of an export; None without ``crs``.
+
+    Raises
+    ------
+    ReferenceSystemError
+        ``crs`` or ``vertical_datum`` is unknown.
+    InvalidParameter
+        ``realization``, ``epoch`` or ``vertical_datum`` comes without ``crs``.
+    """
+    crs, datum = wanted.get("crs"), wanted.get("vertical_datum")
+    realization, epoch = wanted.get("realization"), wanted.get("epoch")
+    if crs is None:
+        if alone := next((n for n in ("realization", "epoch", "vertical_datum") if wanted.get(n) is not None), None):
+            raise InvalidParameter(f"{alone} without crs", field="crs", limit="with crs", cure="state the crs, too")
+        return None
+    name = normalize_crs(crs)
+    reference_system(name)
+    return ExportFrame(name, realization, epoch, normalize_vertical_datum(datum) if datum is not None else None)

@@ -3758,6 +3758,10 @@ export interface components {
             /** @default null */
             bbox?: number[] | null;
             /** @default null */
+            crs?: string | null;
+            /** @default null */
+            epoch?: number | null;
+            /** @default null */
             family?: ("plate" | "magnet" | "cerpm" | "fiducial") | null;
             /** @enum {string} */
             format: "csv" | "geojson" | "gpkg" | "shapefile" | "kml" | "landxml" | "dxf";
@@ -3766,11 +3770,15 @@ export interface components {
             /** @default null */
             polygon?: string | null;
             /** @default null */
+            realization?: string | null;
+            /** @default null */
             road?: string | null;
             /** @default null */
             status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
             /** @default null */
             to_m?: number | null;
+            /** @default null */
+            vertical_datum?: string | null;
         };
         ExtentDocument: {
             spatial: components["schemas"]["SpatialExtent"];
@@ -5047,6 +5055,8 @@ export interface components {
         PackageOptions: {
             /** @default null */
             crs?: string | null;
+            /** @default null */
+            epoch?: number | null;
             /**
              * @default [
              *       "pdf",
@@ -5058,6 +5068,8 @@ export interface components {
             heaters?: boolean;
             /** @default false */
             leds?: boolean;
+            /** @default null */
+            realization?: string | null;
             /** @default null */
             scale?: number | null;
             title_block?: components["schemas"]["TitleBlock"];
@@ -9363,12 +9375,16 @@ export interface operations {
             query?: {
                 bbox?: string | null;
                 code?: string | null;
+                crs?: string | null;
+                epoch?: number | null;
                 family?: ("plate" | "magnet" | "cerpm" | "fiducial") | null;
                 from_m?: number | null;
                 polygon?: string | null;
+                realization?: string | null;
                 road?: string | null;
                 status?: ("planned" | "built" | "surveyed" | "active" | "suspect" | "retired") | null;
                 to_m?: number | null;
+                vertical_datum?: string | null;
             };
             header?: never;
             path: {
@@ -10593,6 +10609,8 @@ export interface operations {
         parameters: {
             query?: {
                 crs?: string | null;
+                epoch?: number | null;
+                realization?: string | null;
                 unit?: ("m" | "ft-us" | "ft-intl") | null;
             };
             header?: never;

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+from xml.etree import ElementTree
 
 import httpx
 import pytest
@@ -216,6 +218,62 @@ def test_files_of_a_plan(client: httpx.Client, alignment: dict[str, Any]) -> Non
     first, in_feet = (float(text.text.splitlines()[-1].split(",")[1]) for text in (metres, feet))
     assert first == pytest.approx(in_feet * 0.3048, abs=1e-3)
     refused(client.get(f"{url}/stakeout-pnezd.csv", params={"crs": "EPSG:1"}), 422)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("crs", "realization", "other", "apart_m"),
+    [("EPSG:25832", "ETRF2000", "ETRF2014", 0.07), ("EPSG:6539", "NAD83(2011)", None, 0.0)],
+)
+def test_stakeout_and_exports_lie_on_the_axis_that_was_sent(
+    client: httpx.Client,
+    other_planner: httpx.Client,
+    crs: str,
+    realization: str,
+    other: str | None,
+    apart_m: float,
+) -> None:
+    """A straight axis along the grid, in its own system, realization and epoch, comes back to a millimetre."""
+    unit_m, start = (1.0, (458_000.0, 5_428_000.0)) if crs == "EPSG:25832" else (1200 / 3937, (990_000.0, 200_000.0))
+    lane = {
+        "type": "Feature",
+        "properties": {"lane": "1", "width_m": 3.5, "speed_limit_kmh": 70},
+        "geometry": {
+            "type": "LineString",
+            "coordinates": [(start[0] + k * 20.0 / unit_m, start[1] + k * 6.0 / unit_m) for k in range(21)],
+        },
+    }
+    data = json.dumps({"type": "FeatureCollection", "features": [lane]}).encode()
+    alignment = send_road(client, data, crs=crs, realization=realization, epoch=2026.4).json()
+    plan = make_plan(client, alignment, lines=None, tags=None, cerpm=None)
+    url = f"/v1/plans/{plan['id']}"
+
+    def staked(**asked: Any) -> dict[str, tuple[float, float]]:
+        lines = client.get(f"{url}/files/stakeout-pnezd.csv", params=asked).text.splitlines()
+        return {line.split(",")[0]: (float(line.split(",")[2]), float(line.split(",")[1])) for line in lines}
+
+    def away_m(at: tuple[float, float]) -> float:
+        east, north = (value * unit_m for value in (at[0] - start[0], at[1] - start[1]))
+        return (6.0 * east - 20.0 * north) / math.hypot(6.0, 20.0)
+
+    points = staked()
+    assert len(points) == plan["counts"]["plate"]
+    assert max(abs(away_m(at)) for at in points.values()) < 0.001
+    if other is not None:
+        elsewhere = staked(realization=other)
+        apart = [math.dist(points[name], elsewhere[name]) for name in points]
+        assert apart == pytest.approx([apart_m] * len(apart), abs=0.02)
+        refused(client.get(f"{url}/files/stakeout-pnezd.csv", params={"realization": "GDA2020"}), 422)
+    assert other_planner.post(f"{url}/approve", headers={"If-Match": '"1"'}).status_code == 200
+    assert client.post(f"{url}/commit", headers={"If-Match": '"2"'}).status_code == 201
+    document = ElementTree.fromstring(client.get("/v1/exports/landxml").content)
+    space = "{http://www.landxml.org/schema/LandXML-1.2}"
+    system = document.find(f"{space}CoordinateSystem")
+    assert system is not None
+    assert system.attrib["epsgCode"] == crs.removeprefix("EPSG:")
+    assert realization in system.attrib["desc"]
+    exported = sorted((float(e), float(n)) for n, e in (str(p.text).split() for p in document.iter(f"{space}CgPoint")))
+    assert exported == [pytest.approx(at, abs=2e-4) for at in sorted(points.values())]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,232 @@
+"""Coordinates come out of the registry as they went in: 25 systems, in every format that can carry them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import ezdxf
+import httpx
+import numpy as np
+import pytest
+import shapely
+from pyogrio import raw
+from pyproj import CRS, Transformer
+
+from app.formats.surveys.coordinates import crs_unit
+from app.formats.surveys.declaration import METRES
+from app.geodesy import reference_system
+from app.values import Floats
+from tests.machine import require_tool
+
+
+class Declared(NamedTuple):
+    """What an agency declares of its survey."""
+
+    crs: str
+    realization: str | None = None
+    epoch: float | None = None
+
+
+SYSTEMS = (
+    Declared("EPSG:25832", "ETRF2000", 2026.4),  # Germany
+    Declared("EPSG:25833", "ETRF2014", 2026.4),
+    Declared("EPSG:25831"),  # ETRS89 without a realization
+    Declared("EPSG:2154", "RGF93 v1", 2026.0),  # France
+    Declared("EPSG:27700"),  # Great Britain
+    Declared("EPSG:28992"),  # Netherlands
+    Declared("EPSG:31370"),  # Belgium
+    Declared("EPSG:2056"),  # Switzerland
+    Declared("EPSG:31256"),  # Austria
+    Declared("EPSG:2180", "ETRF2000-PL", 2026.0),  # Poland
+    Declared("EPSG:2178"),  # Poland, with the zone in the eastings
+    Declared("EPSG:5514"),  # Czechia, axes to the south and west
+    Declared("EPSG:3067", "ETRF2000", 2026.4),  # Finland
+    Declared("EPSG:3006", "SWEREF99", 2026.0),  # Sweden
+    Declared("EPSG:5110"),  # Norway
+    Declared("EPSG:3763", "ETRF2000", 2026.4),  # Portugal
+    Declared("EPSG:6539", "NAD83(2011)", 2010.0),  # New York, US survey feet
+    Declared("EPSG:2992"),  # Oregon, international feet
+    Declared("EPSG:7855", "GDA2020", 2026.4),  # Australia
+    Declared("EPSG:2193"),  # New Zealand
+    Declared("EPSG:6677"),  # Japan, northing first
+    Declared("EPSG:5179"),  # Korea
+    Declared("EPSG:2326"),  # Hong Kong
+    Declared("EPSG:31983"),  # Brazil
+    Declared("EPSG:32632", "WGS 84 (G2139)", 2026.4),  # UTM of WGS 84
+)
+FORMATS = ("csv", "geojson", "gpkg", "shapefile", "landxml", "dxf")
+LIMIT_MM = 1.0
+
+
+def places(crs: str) -> Floats:
+    """Easting, northing in the unit of the system, and height [m], of three points in its area, shape (3, 3)."""
+    system = reference_system(crs)
+    area = system.area_of_use
+    lon = area.west + 0.45 * ((area.east - area.west) % 360.0)
+    lat = area.south + 0.55 * (area.north - area.south)
+    x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
+    unit = 1 / METRES[crs_unit(system)]
+    steps = np.array([(0.0, 0.0, 0.0), (37.1234, 12.3456, 1.25), (-21.9876, 80.4321, -2.5)])
+    table = np.round(np.array([x, y, 130.0]) + steps * [unit, unit, 1.0], 4)
+    return np.asarray(table)
+
+
+def survey(table: Floats, first: int) -> bytes:
+    lines = [f"{first + k},{x:.4f},{y:.4f},{z:.4f}" for k, (x, y, z) in enumerate(table.tolist())]
+    return "\n".join(["number,easting,northing,height", *lines]).encode()
+
+
+def imported(client: httpx.Client, declared: Declared, table: Floats, road: str, first: int = 1) -> None:
+    declaration = {
+        "family": "cerpm", "columns": {"code": "number"}, "road": road, "crs": declared.crs,
+        "vertical_datum": "ellipsoid", "height_unit": "m",
+        **{name: value for name, value in declared._asdict().items() if value is not None},
+    }  # fmt: skip
+    form = {"declaration": json.dumps(declaration)}
+    answer = client.post("/v1/imports", files={"file": ("survey.csv", survey(table, first))}, data=form)
+    assert answer.status_code == 201, answer.text
+
+
+def read_back(kind: str, content: bytes, folder: Path, unit_m: float) -> Floats:
+    """Easting, northing and height [m] of each marker by a reader of another program, in the order of their codes."""
+    rows: list[tuple[int, float, float, float]] = []
+    if kind == "csv":
+        for row in csv.DictReader(io.StringIO(content.decode())):
+            rows.append((int(row["code"]), float(row["x"]), float(row["y"]), float(row["z_m"])))
+    elif kind == "geojson":
+        for feature in json.loads(content)["features"]:
+            rows.append((int(feature["properties"]["code"]), *feature["geometry"]["coordinates"]))
+    elif kind in ("gpkg", "shapefile"):
+        path = folder / f"a.{'gpkg' if kind == 'gpkg' else 'shp.zip'}"
+        path.write_bytes(content)
+        meta, _, geometry, fields = raw.read(path if kind == "gpkg" else f"/vsizip/{path}")
+        codes = fields[list(meta["fields"]).index("code")]
+        points = shapely.get_coordinates(shapely.from_wkb(geometry), include_z=True)
+        rows = [(int(code), *point) for code, point in zip(codes, points.tolist(), strict=True)]
+    elif kind == "landxml":
+        for point in ElementTree.fromstring(content).iter("{http://www.landxml.org/schema/LandXML-1.2}CgPoint"):
+            north, east, up = map(float, str(point.text).split())
+            rows.append((int(point.attrib["name"]), east, north, up * unit_m))
+    else:
+        for inserted in ezdxf.read(io.StringIO(content.decode())).modelspace():
+            texts = {attribute.dxf.tag: attribute.dxf.text for attribute in inserted.attribs}
+            x, y, z = inserted.dxf.insert
+            rows.append((int(texts["CODE"]), x, y, z * unit_m))
+    return np.array(sorted(rows), np.float64)[:, 1:]
+
+
+def test_coordinates_come_out_as_they_went_in(
+    client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = []
+    for number, declared in enumerate(SYSTEMS):
+        system = reference_system(declared.crs)
+        unit_m = METRES[crs_unit(system)]
+        table, road = places(declared.crs), f"road {number}"
+        imported(client, declared, table, road, 3 * number + 1)
+        worst_mm: dict[str, float] = {}
+        for kind in FORMATS:
+            asked = {} if kind in ("landxml", "dxf") else {"crs": declared.crs}
+            answer = client.get(f"/v1/exports/{kind}", params={"road": road, **asked})
+            assert answer.status_code == 200, f"{declared} {kind}: {answer.text}"
+            folder = tmp_path / f"{number}-{kind}"
+            folder.mkdir()
+            found = read_back(kind, answer.content, folder, unit_m)
+            away_mm = np.abs(found - table) * [unit_m * 1000, unit_m * 1000, 1000]
+            worst_mm[kind] = float(away_mm.max())
+        lines.append(f"| {declared.crs} {system.name} | {declared.realization or '-'} | "
+                     + " | ".join(f"{worst_mm[kind]:.2f}" for kind in FORMATS) + " |")  # fmt: skip
+        assert max(worst_mm.values()) < LIMIT_MM, (declared, worst_mm)
+    with capsys.disabled():
+        print("\n".join(["", f"| system | realization | {' | '.join(FORMATS)} |", "|---|---|" + "--:|" * 6, *lines]))
+
+
+@pytest.mark.parametrize(
+    ("declared", "asked"),
+    [
+        (Declared("EPSG:25832", "ETRF2000", 2026.4), {"crs": "EPSG:25832", "realization": "ETRF2014"}),
+        (Declared("EPSG:32632", "ITRF2014", 2026.4), {"crs": "EPSG:25832", "realization": "ETRF2000"}),
+        (Declared("EPSG:6539", "NAD83(2011)", 2010.0), {"crs": "EPSG:32618"}),
+    ],
+)
+def test_other_frames_are_those_of_proj_used_directly(
+    client: httpx.Client, tmp_path: Path, declared: Declared, asked: dict[str, str]
+) -> None:
+    """`cs2cs` with each step in its own coordinates: what is exported is what PROJ gives without this server."""
+    cs2cs = require_tool("cs2cs", "proj-bin")
+    table = places(declared.crs)
+    imported(client, declared, table, "a road")
+    unit_m = METRES[crs_unit(reference_system(asked["crs"]))]
+    answer = client.get("/v1/exports/csv", params={"road": "a road", **asked})
+    found = read_back("csv", answer.content, tmp_path, unit_m)
+    codes = {"ETRF2000": "EPSG:7931", "ETRF2014": "EPSG:8403", "NAD83(2011)": "EPSG:6319"}  # geographic, with heights
+    own, itrf = CRS(declared.crs).geodetic_crs, "EPSG:7912"
+    assert own is not None
+    steps: list[tuple[str, str]] = []
+    frame, target = codes.get(declared.realization or "", itrf), codes.get(asked.get("realization", ""), itrf)
+    lon, lat = Transformer.from_crs(declared.crs, own, always_xy=True).transform(table[:, 0], table[:, 1])
+    steps += [(frame, itrf)] * (frame != itrf) + [(itrf, target)] * (target != itrf)
+    rows = np.column_stack([lat, lon, table[:, 2]])
+    for source, goal in steps:
+        given = "\n".join(f"{a:.12f} {b:.12f} {h:.5f} {declared.epoch}" for a, b, h in rows.tolist())
+        command = [cs2cs, "-f", "%.12f", source, goal]
+        out = subprocess.run(command, input=given, capture_output=True, text=True, check=True, timeout=60).stdout
+        rows = np.array([[float(word) for word in line.split()[:3]] for line in out.splitlines()])
+    base = CRS(asked["crs"]).geodetic_crs
+    assert base is not None
+    x, y = Transformer.from_crs(base, asked["crs"], always_xy=True).transform(rows[:, 1], rows[:, 0])
+    expected = np.column_stack([x, y, rows[:, 2]])
+    assert found * [unit_m, unit_m, 1] == pytest.approx(expected * [unit_m, unit_m, 1], abs=1e-3)
+    row = next(csv.DictReader(io.StringIO(answer.text)))
+    assert (row["geometry_crs"], float(row["geometry_epoch"])) == (asked["crs"], declared.epoch)
+    assert row["geometry_realization"] == asked.get("realization", "")
+
+
+def test_an_epoch_moves_coordinates_with_their_plate(client: httpx.Client, tmp_path: Path) -> None:
+    declared = Declared("EPSG:32632", "ITRF2014", 2020.0)
+    table = places(declared.crs)
+    imported(client, declared, table, "a road")
+    wanted = {"road": "a road", "crs": "EPSG:32632", "epoch": 2030.0}
+    moved = read_back("csv", client.get("/v1/exports/csv", params=wanted).content, tmp_path, 1.0) - table
+    assert np.hypot(moved[:, 0], moved[:, 1]) == pytest.approx(np.full(3, 0.25), abs=0.03)  # 2.5 cm a year in Europe
+    assert (moved[:, :2] > 0).all()  # to the north-east
+
+
+@pytest.mark.parametrize(
+    ("asked", "status", "field", "word"),
+    [
+        ({"crs": "EPSG:25832", "realization": "NAD83(2011)"}, 422, "realization", "not a realization"),
+        ({"crs": "EPSG:25832", "vertical_datum": "EPSG:7837"}, 422, "vertical_datum", "grid"),
+        ({"crs": "EPSG:25832", "vertical_datum": "EPSG:99999"}, 422, "vertical_datum", "not a vertical datum"),
+        ({"crs": "EPSG:7855"}, 422, "crs", "outside the area"),
+        ({"crs": "county"}, 422, "crs", "not a coordinate reference system"),
+        ({"realization": "ETRF2000"}, 422, "crs", "without crs"),
+        ({"crs": "EPSG:25832", "epoch": 1800}, 422, "epoch", ""),
+    ],
+)
+@pytest.mark.parametrize("kind", ["csv", "gpkg"])
+def test_frames_that_cannot_be_written_are_refused(
+    client: httpx.Client, kind: str, asked: dict[str, Any], status: int, field: str, word: str
+) -> None:
+    declared = Declared("EPSG:25832", "ETRF2000", 2026.4)
+    imported(client, declared, places(declared.crs), "a road")
+    answer = client.get(f"/v1/exports/{kind}", params=asked)
+    assert answer.status_code == status, answer.text
+    problem = answer.json()
+    assert word in problem["detail"]
+    assert field in str(problem["field"])
+    if word == "grid":
+        assert "projsync --file" in problem["cure"]
+
+
+def test_kml_is_in_wgs_84_and_landxml_is_projected(client: httpx.Client) -> None:
+    declared = Declared("EPSG:25832", "ETRF2000", 2026.4)
+    imported(client, declared, places(declared.crs), "a road")
+    for kind, crs in (("kml", "EPSG:25832"), ("landxml", "EPSG:4258"), ("dxf", "EPSG:4258")):
+        assert client.get(f"/v1/exports/{kind}", params={"crs": crs}).json()["field"] == "crs"
