@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -597,7 +597,7 @@ def _transformed(
     )
 
 
-def _undone(transformer: Transformer, lon_deg: Floats, lat_deg: Floats, *more: Floats) -> tuple[Floats, ...]:
+def _undone(transformer: Any, lon_deg: Floats, lat_deg: Floats, *more: Floats) -> tuple[Floats, ...]:
     """What a transformer turns into these positions: longitude, latitude, and the height where one comes in.
 
     PROJ's own inverse of a transformation without heights is off by a millimetre, because the height that such a

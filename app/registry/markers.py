@@ -577,9 +577,7 @@ def list_records(
         "code": markers.c.digits,
         "side": markers.c.spec["side"].as_string(),
         "origin_crs": _origin_crs(),
-        "origin_realization": sa.func.coalesce(
-            markers.c.original[("plan", "realization")].as_string(), markers.c.original["realization"].as_string()
-        ),
+        "origin_realization": _origin_realization(),
     }
     columns = [own[name].label(name) if name in own else markers.c[name] for name in fields]
     query = sa.select(*columns).where(markers.c.agency_id == agency_id, *conditions_of(filtered))
@@ -591,6 +589,26 @@ def list_records(
 
 def _origin_crs() -> sa.ColumnElement[str]:
     return sa.func.coalesce(markers.c.original[("plan", "crs")].as_string(), markers.c.crs)
+
+
+def _origin_realization() -> sa.ColumnElement[str | None]:
+    of_plan, own = markers.c.original[("plan", "realization")], markers.c.original["realization"]
+    return sa.func.coalesce(of_plan.as_string(), own.as_string())
+
+
+class MarkerOrigin(NamedTuple):
+    """How a marker, or the road of its plan, came."""
+
+    crs: str
+    realization: str | None
+    transform_accuracy_m: float | None
+
+
+def find_origins(connection: sa.Connection, agency_id: str, ids: Sequence[str]) -> dict[str, MarkerOrigin]:
+    """Origins of markers, by their ids."""
+    columns = (markers.c.id, _origin_crs(), _origin_realization(), markers.c.transform_accuracy_m)
+    query = sa.select(*columns).where(markers.c.agency_id == agency_id, markers.c.id.in_(ids))
+    return {str(row[0]): MarkerOrigin(*row[1:]) for row in connection.execute(query)}
 
 
 def origins(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> list[tuple[str, str | None]]:

@@ -99,7 +99,7 @@ def get_item(
         ],
     }
     if query.is_page:
-        return html_response(item_page(base, collection, query.crs, query.pairs, feature))
+        return html_response(item_page(base, collection, str(query.crs), query.pairs, feature))
     version = feature["properties"].get("version")
     return answer(document, GEOJSON, crs=query.crs, headers={"ETag": f'"{version}"'} if version is not None else None)
 

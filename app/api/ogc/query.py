@@ -13,11 +13,12 @@ from urllib.parse import parse_qsl
 from starlette.requests import Request
 
 from app.api.ogc.cql2 import LANGUAGES, Reader
-from app.errors import MalformedRequest
+from app.errors import MalformedRequest, ReferenceSystemError
+from app.geodesy import reference_system
 from app.registry.conditions import Condition
 from app.registry.features import FeatureFilter
 from app.registry.spatial import Box
-from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection, FeatureCrs
+from app.services.markers.features import COLLECTIONS, EPSG_URI, STORAGE_CRS, AnyCrs, Collection, FeatureCrs, OtherCrs
 from app.services.markers.searches import MAX_OVER_ANTIMERIDIAN_DEG
 
 # === The parameters of requests under /ogc in one list: /ogc/api, /openapi.json and the query's reader use it.
@@ -28,7 +29,7 @@ MAX_LIMIT = 10_000
 DEFAULT_HTML_LIMIT = 100
 MAX_HTML_LIMIT = 1000
 """In HTML: browsers draw all rows of a table before they show one."""
-_CRS = {"type": "string", "format": "uri", "enum": list(FeatureCrs), "default": STORAGE_CRS}
+_CRS = {"type": "string", "format": "uri", "default": STORAGE_CRS, "examples": list(FeatureCrs)}
 _NUMBERS = {"type": "array", "minItems": 4, "maxItems": 6, "items": {"type": "number"}}
 
 
@@ -41,7 +42,11 @@ class Parameter(NamedTuple):
 
 _COMMON = {
     "f": Parameter({"type": "string", "enum": ["json", "html"]}, "Format; without it the Accept header decides"),
-    "crs": Parameter(_CRS, "CRS of the response, its axes in the authority's order"),
+    "crs": Parameter(
+        _CRS,
+        "CRS of the response, its axes in the authority's order: one that the collection lists, or any other of the "
+        f"EPSG registry, as {EPSG_URI}25832",
+    ),
     "bbox": Parameter(_NUMBERS, "west,south,east,north; west is greater across the antimeridian"),
     "bbox-crs": Parameter(_CRS, "CRS of bbox"),
     "datetime": Parameter({"type": "string"}, "Last change: a moment, a/b, ../b or a/.."),
@@ -124,7 +129,7 @@ class ItemsQuery:
     filtered: FeatureFilter
     limit: int
     after: str | None
-    crs: FeatureCrs
+    crs: AnyCrs
     hits: bool
     counted: bool
     is_page: bool = False
@@ -221,20 +226,26 @@ def items_query(pairs: list[tuple[str, str]], collection: Collection, *, is_page
     )
 
 
-def crs_parameter(found: dict[str, str], name: str) -> FeatureCrs:
+def crs_parameter(found: dict[str, str], name: str) -> AnyCrs:
     """The CRS that a parameter names.
 
     Raises
     ------
     MalformedRequest
-        It is none of ours.
+        It is neither listed nor a horizontal system of the EPSG registry.
     """
-    given = found.get(name)
-    if given is None:
+    sent = found.get(name)
+    if sent is None:
         return STORAGE_CRS
-    if given not in list(FeatureCrs):
-        refuse(name, "this CRS is not offered", ", ".join(FeatureCrs))
-    return FeatureCrs(given)
+    if sent in list(FeatureCrs):
+        return FeatureCrs(sent)
+    if re.fullmatch(re.escape(EPSG_URI) + "[0-9]{4,6}", sent, re.ASCII):
+        try:
+            reference_system(OtherCrs(sent).name)
+        except ReferenceSystemError as error:
+            refuse(name, error.message, f"geographic or projected systems, {EPSG_URI}CODE")
+        return OtherCrs(sent)
+    refuse(name, "this is not the URI of a CRS that is served", f"{', '.join(FeatureCrs)}, or {EPSG_URI}CODE")
 
 
 def number(name: str, text: str) -> float:
@@ -318,8 +329,13 @@ def _bbox(found: dict[str, str]) -> tuple[Box | None, tuple[float, float] | None
     half = len(numbers) // 2
     low, high = numbers[:half], numbers[half:]
     heights_m = (low[2], high[2]) if half == 3 else None
-    west, south = crs.to_lon_lat(low[0], low[1])
-    east, north = crs.to_lon_lat(high[0], high[1])
+    if isinstance(crs, OtherCrs):
+        west, south, east, north = crs.bounds_deg((low[0], low[1]), (high[0], high[1]))
+        if not all(map(math.isfinite, (west, south, east, north))):
+            refuse("bbox", f"bbox lies outside the area of {crs.name}", "a box in the area of bbox-crs")
+    else:
+        west, south = crs.to_lon_lat(low[0], low[1])
+        east, north = crs.to_lon_lat(high[0], high[1])
     if south > north or (heights_m is not None and heights_m[0] > heights_m[1]):
         refuse(
             "bbox", "bbox has its upper bound below its lower one", "lower corner first; west of east may be greater"

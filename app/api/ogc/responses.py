@@ -38,7 +38,7 @@ from app.api.ogc.query import (
     refuse,
 )
 from app.errors import InvalidParameter
-from app.services.markers.features import Collection, FeatureCrs, Features, get_collection, no_feature
+from app.services.markers.features import AnyCrs, Collection, Features, get_collection, no_feature
 from app.services.request_work import counted
 from app.values import JsonObject
 
@@ -317,7 +317,7 @@ def answer(
     kind: str = JSON,
     *,
     status: int = 200,
-    crs: FeatureCrs | None = None,
+    crs: AnyCrs | None = None,
     headers: dict[str, str] | None = None,
 ) -> Response:
     """A JSON document, as the key's owner alone may keep it."""
@@ -431,7 +431,7 @@ class ItemQuery:
     """What a request for one item asks for: parameters as they were sent, the CRS, and whether it wants HTML."""
 
     pairs: list[tuple[str, str]]
-    crs: FeatureCrs
+    crs: AnyCrs
     is_page: bool
 
 

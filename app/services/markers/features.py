@@ -7,20 +7,26 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 from itertools import islice
-from typing import Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
+import numpy as np
 import orjson
 import shapely
 import sqlalchemy as sa
+from pyproj.enums import TransformDirection
 
-from app.errors import NotFound
+from app.errors import MalformedRequest, NotFound
 from app.families import FAMILIES
+from app.formats.exports import ExportFrame, frame_records
+from app.geodesy import reference_system
+from app.geodesy.place import PLATE_FIXED_EPOCH
+from app.geodesy.systems import ELLIPSOID, best_effort, covers
 from app.registry import features as store
 from app.registry.audit import find_head
 from app.registry.conditions import holds, pinned_values
@@ -28,6 +34,7 @@ from app.registry.database import Database
 from app.registry.features import FIELDS, ON_ROAD, RETIRED, Extent, FeatureFilter, FeatureTable, Field
 from app.registry.health import ITEM_FIELDS, MAINTENANCE
 from app.registry.lines import LINE_FIELDS, Line, find_line, read_lines
+from app.registry.markers import MarkerOrigin, find_origins
 from app.registry.plan_features import LANE_FIELDS, PLAN_FIELDS, PLANNED, AlignmentLanes
 from app.registry.spatial import Box
 from app.registry.tiles import COARSE_ZOOM, GROUPED_ZOOM, MAX_SINGLE, FeatureGrid, Tile, feature_tile, read_grid
@@ -43,7 +50,7 @@ _MERCATOR_POLE_DEG = 89.999999
 
 
 class FeatureCrs(StrEnum):
-    """A CRS by its URI. All three are WGS 84, so that going from one to another loses nothing."""
+    """A CRS by its URI, of those that are listed. All are WGS 84, so that going from one to another loses nothing."""
 
     CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
     CRS84H = "http://www.opengis.net/def/crs/OGC/0/CRS84h"
@@ -76,6 +83,39 @@ class FeatureCrs(StrEnum):
 
 
 STORAGE_CRS = FeatureCrs.CRS84
+EPSG_URI = "http://www.opengis.net/def/crs/EPSG/0/"
+
+
+@dataclass(frozen=True, slots=True)
+class OtherCrs:
+    """Any other system of the EPSG registry, in which features are served on request."""
+
+    uri: str
+
+    is_storage: ClassVar[bool] = False
+
+    def __str__(self) -> str:
+        return self.uri
+
+    @property
+    def name(self) -> str:
+        """``EPSG:code``."""
+        return f"EPSG:{self.uri.removeprefix(EPSG_URI)}"
+
+    @property
+    def is_north_first(self) -> bool:
+        """Whether the authority's first axis points to the north, and the second one to the east."""
+        return [axis.direction for axis in reference_system(self.name).axis_info[:2]] == ["north", "east"]
+
+    def bounds_deg(self, low: tuple[float, float], high: tuple[float, float]) -> tuple[float, float, float, float]:
+        """West, south, east and north of a box by two of its corners, to a metre."""
+        if self.is_north_first:
+            low, high = low[::-1], high[::-1]
+        west, south, east, north = best_effort(self.name).transform_bounds(*low, *high)
+        return west, south, east, north
+
+
+AnyCrs = FeatureCrs | OtherCrs
 
 
 # === Collections: what clients list as layers.
@@ -303,7 +343,7 @@ class Features:
         *,
         after: str | None = None,
         limit: int = 1000,
-        crs: FeatureCrs = STORAGE_CRS,
+        crs: AnyCrs = STORAGE_CRS,
         counted: bool = False,
     ) -> Page:
         """A page of features in a fixed order, counted if that is asked for or costs little.
@@ -311,7 +351,7 @@ class Features:
         Raises
         ------
         MalformedRequest
-            There is no line to go on after.
+            There is no line to go on after, or no feature of the page has a place in the CRS.
         """
         agency_id, is_first = caller.agency_id, after is None
         if collection.lines is not None:
@@ -327,7 +367,8 @@ class Features:
         del texts[limit:]
         last = orjson.loads(texts[-1])["id"] if has_more else None
         if not crs.is_storage:
-            texts = [orjson.dumps(_in_crs(orjson.loads(text), crs)).decode() for text in texts]
+            found = self._in_crs(agency_id, collection, [orjson.loads(text) for text in texts], crs)
+            texts = [orjson.dumps(feature).decode() for feature in found]
         return Page(_joined(texts), len(texts), last, matched)
 
     def _page_of_lines(
@@ -337,7 +378,7 @@ class Features:
         filtered: FeatureFilter,
         after: str | None,
         limit: int,
-        crs: FeatureCrs,
+        crs: AnyCrs,
         counted: bool,
     ) -> Page:
         """Lines are found one by one, so that a first page is counted by going on to the last one."""
@@ -351,7 +392,7 @@ class Features:
             if after is not None and counted:
                 matched = _count_lines(connection, agency_id, lines, filtered)
         del page[limit:]
-        texts = [orjson.dumps(_line(line, crs)).decode() for line in page]
+        texts = [orjson.dumps(feature).decode() for feature in _in_crs([_line(line) for line in page], crs, {})]
         return Page(_joined(texts), len(page), page[-1].id if has_more else None, matched)
 
     def count(self, caller: Caller, collection: Collection, filtered: FeatureFilter) -> int:
@@ -362,7 +403,7 @@ class Features:
                 return _count_lines(connection, agency_id, collection.lines, filtered)
         return self._ask(collection.table, lambda c: store.count_features(c, agency_id, filtered))
 
-    def get(self, caller: Caller, collection: Collection, feature_id: str, crs: FeatureCrs = STORAGE_CRS) -> JsonObject:
+    def get(self, caller: Caller, collection: Collection, feature_id: str, crs: AnyCrs = STORAGE_CRS) -> JsonObject:
         """One feature.
 
         Raises
@@ -376,11 +417,22 @@ class Features:
                 line = collection.lines.find(connection, agency_id, feature_id)
             if line is None:
                 raise no_feature(collection)
-            return _line(line, crs)
+            return _in_crs([_line(line)], crs, {})[0]
         text = self._ask(table, lambda c: store.find_feature(c, agency_id, feature_id, table))
         if text is None:
             raise no_feature(collection)
-        return _in_crs(orjson.loads(text), crs)
+        return self._in_crs(agency_id, collection, [orjson.loads(text)], crs)[0]
+
+    def _in_crs(
+        self, agency_id: str, collection: Collection, features: list[JsonObject], crs: AnyCrs
+    ) -> list[JsonObject]:
+        """Features of points in a CRS; markers that came in it come back as they came."""
+        origins: dict[str, MarkerOrigin] = {}
+        if isinstance(crs, OtherCrs) and collection.table.plans is None:
+            ids = [str(feature["id"]) for feature in features]
+            with self._database.read() as connection:
+                origins = find_origins(connection, agency_id, ids)
+        return _in_crs(features, crs, origins)
 
     def extent(self, caller: Caller, collection: Collection) -> Extent | None:
         """What the agency's features cover, as it was within the last minute."""
@@ -457,11 +509,11 @@ def _crosses(line: Line, box: Box) -> bool:
     )
 
 
-def _line(line: Line, crs: FeatureCrs) -> JsonObject:
+def _line(line: Line) -> JsonObject:
     return {
         "type": "Feature",
         "id": line.id,
-        "geometry": {"type": "LineString", "coordinates": [crs.from_lon_lat(*point) for point in line.points]},
+        "geometry": {"type": "LineString", "coordinates": list(line.points)},
         "properties": line.properties,
     }
 
@@ -475,7 +527,74 @@ def _joined(features: list[str]) -> orjson.Fragment:
     return orjson.Fragment(f"[{','.join(features)}]")
 
 
-def _in_crs(feature: JsonObject, crs: FeatureCrs) -> JsonObject:
-    lon_deg, lat_deg, *height_m = feature["geometry"]["coordinates"]
-    feature["geometry"]["coordinates"] = (*crs.from_lon_lat(lon_deg, lat_deg), *height_m)
-    return feature
+def _in_crs(features: Sequence[JsonObject], crs: AnyCrs, origins: Mapping[str, MarkerOrigin]) -> list[JsonObject]:
+    """Features with their coordinates in a CRS; those that it does not reach have no geometry.
+
+    Raises
+    ------
+    MalformedRequest
+        No feature has a place in it.
+    """
+    parts = [_vertices(feature) for feature in features]
+    vertices = [vertex for part in parts for vertex in part]
+    if isinstance(crs, OtherCrs):
+        placed = _in_other_crs(features, parts, crs, origins)
+    else:
+        placed = [(*crs.from_lon_lat(lon_deg, lat_deg), *up) for lon_deg, lat_deg, *up in vertices]
+    rest = iter(placed)
+    for feature, part in zip(features, parts, strict=True):
+        own = list(islice(rest, len(part)))
+        is_point = feature["geometry"]["type"] == "Point"
+        geometry = {**feature["geometry"], "coordinates": own[0] if is_point else own}
+        feature["geometry"] = None if None in own else geometry
+    return list(features)
+
+
+def _vertices(feature: JsonObject) -> list[Sequence[float]]:
+    geometry = feature["geometry"]
+    return [geometry["coordinates"]] if geometry["type"] == "Point" else geometry["coordinates"]
+
+
+def _in_other_crs(
+    features: Sequence[JsonObject],
+    parts: Sequence[Sequence[Sequence[float]]],
+    crs: OtherCrs,
+    origins: Mapping[str, MarkerOrigin],
+) -> list[tuple[float, ...] | None]:
+    """Each vertex in the order of the authority's axes; None where it lies outside the system's area.
+
+    Without an epoch, that of plate-fixed systems is assumed.
+    """
+    records: list[JsonObject] = []
+    for feature, part in zip(features, parts, strict=True):
+        known = origins.get(str(feature["id"]), MarkerOrigin("OGC:CRS84", None, 0.0))
+        same = {
+            "vertical_datum": ELLIPSOID, "epoch": feature["properties"].get("epoch") or PLATE_FIXED_EPOCH,
+            "origin_crs": known.crs, "origin_realization": known.realization,
+            "transform_accuracy_m": known.transform_accuracy_m,
+        }  # fmt: skip
+        for lon_deg, lat_deg, *up in part:
+            records.append({"lon_deg": lon_deg, "lat_deg": lat_deg, "height_m": up[0] if up else None, **same})
+    framed, problem = frame_records(records, ExportFrame(crs.name, vertical_datum=ELLIPSOID, needs_heights=False))
+    _place_roughly(framed, crs)
+    if problem is not None and all(record["x"] is None for record in framed):
+        raise MalformedRequest(problem.message, field="crs", limit=problem.limit, cure=problem.cure)
+    order = ("y", "x") if crs.is_north_first else ("x", "y")
+    return [
+        None if record["x"] is None
+        else (*(record[name] for name in order), *([] if record["z_m"] is None else [record["z_m"]]))
+        for record in framed
+    ]  # fmt: skip
+
+
+def _place_roughly(framed: Sequence[JsonObject], crs: OtherCrs) -> None:
+    """Places by PROJ's best operation, where none states its accuracy; maps need no better ones."""
+    lost = [record for record in framed if record["x"] is None]
+    if not lost:
+        return
+    lon, lat = (np.array([record[name] for record in lost], np.float64) for name in ("lon_deg", "lat_deg"))
+    x, y = best_effort(crs.name).transform(lon, lat, direction=TransformDirection.INVERSE)
+    inside = covers(reference_system(crs.name).area_of_use, lon, lat) & np.isfinite(x) & np.isfinite(y)
+    for record, is_inside, first, second in zip(lost, inside, x.tolist(), y.tolist(), strict=True):
+        if is_inside:
+            record.update(x=first, y=second)

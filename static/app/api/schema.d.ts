@@ -7494,19 +7494,19 @@ export interface operations {
                 alignment?: string;
                 alignment_id?: string;
                 bbox?: number[];
-                "bbox-crs"?: "http://www.opengis.net/def/crs/OGC/1.3/CRS84" | "http://www.opengis.net/def/crs/OGC/0/CRS84h" | "http://www.opengis.net/def/crs/EPSG/0/4326" | "http://www.opengis.net/def/crs/EPSG/0/3857";
+                "bbox-crs"?: string;
                 chainage_m?: number;
                 check_points?: number;
                 code?: string;
                 count?: boolean;
-                crs?: "http://www.opengis.net/def/crs/OGC/1.3/CRS84" | "http://www.opengis.net/def/crs/OGC/0/CRS84h" | "http://www.opengis.net/def/crs/EPSG/0/4326" | "http://www.opengis.net/def/crs/EPSG/0/3857";
+                crs?: string;
                 datetime?: string;
                 earlier?: string;
                 epoch?: number;
                 f?: "json" | "html";
                 family?: string;
                 filter?: string;
-                "filter-crs"?: "http://www.opengis.net/def/crs/OGC/1.3/CRS84" | "http://www.opengis.net/def/crs/OGC/0/CRS84h" | "http://www.opengis.net/def/crs/EPSG/0/4326" | "http://www.opengis.net/def/crs/EPSG/0/3857";
+                "filter-crs"?: string;
                 "filter-lang"?: "cql2-text" | "cql2-json" | "cql-text";
                 heading_deg?: number;
                 heading_rmse_deg?: number;
@@ -7613,7 +7613,7 @@ export interface operations {
     get_item: {
         parameters: {
             query?: {
-                crs?: "http://www.opengis.net/def/crs/OGC/1.3/CRS84" | "http://www.opengis.net/def/crs/OGC/0/CRS84h" | "http://www.opengis.net/def/crs/EPSG/0/4326" | "http://www.opengis.net/def/crs/EPSG/0/3857";
+                crs?: string;
                 f?: "json" | "html";
             };
             header?: never;

@@ -245,6 +245,33 @@ def test_times(client: httpx.Client, row: list[str]) -> None:
     assert row[0] in ids(get(client, datetime=moment[:10]))
 
 
+def test_any_system_of_the_registry_is_served(client: httpx.Client) -> None:
+    """A marker that came in a national system comes back as it came; axes are in the authority's order."""
+    sent = {"easting_m": 458_123.4567, "northing_m": 5_428_765.4321, "crs": "EPSG:25832", "realization": "ETRF2000"}
+    position = {**sent, "epoch": 2026.4, "height_m": 130.0, "horizontal_rmse_m": 0.01, "vertical_datum": "ellipsoid"}
+    body = {"family": "cerpm", "position": position, "side": "left", "road": "A8"}
+    made = client.post("/v1/markers", json=body)
+    assert made.status_code == 201, made.text
+    uri = "http://www.opengis.net/def/crs/EPSG/0/"
+    answer = client.get(ITEMS, params={"crs": f"{uri}25832", "road": "A8"})
+    assert answer.headers["content-crs"] == f"<{uri}25832>"
+    (feature,) = answer.json()["features"]
+    assert feature["geometry"]["coordinates"] == pytest.approx([458_123.4567, 5_428_765.4321, 130.0], abs=1e-4)
+    url = f"{ITEMS}/{feature['id']}"
+    north_first = client.get(url, params={"crs": f"{uri}31467"}).json()["geometry"]["coordinates"]
+    assert north_first[0] > 5e6 > north_first[1]
+    lat_first = client.get(url, params={"crs": f"{uri}4258"}).json()["geometry"]["coordinates"]
+    assert lat_first[:2] == pytest.approx([49.010, 8.427], abs=1e-3)
+    page = client.get(url, params={"crs": f"{uri}25832", "f": "html"}).text
+    assert "458123" in page.replace(",", "").replace(" ", "")
+    far = client.get(url, params={"crs": f"{uri}2326"})
+    assert (far.status_code, far.json()["field"]) == (400, "crs")
+    inside = {"bbox": "458100,5428700,458200,5428800", "bbox-crs": f"{uri}25832", "road": "A8"}
+    assert len(client.get(ITEMS, params=inside).json()["features"]) == 1
+    outside = inside | {"bbox": "458200,5428700,458300,5428800"}
+    assert client.get(ITEMS, params=outside).json()["features"] == []
+
+
 BAD = [
     "nonsense=1",
     "limit=ten",
@@ -266,7 +293,10 @@ BAD = [
     "bbox=1_0,0,20,1",
     "bbox-crs=" + CRS84,
     "bbox=0,0,1,1&bbox-crs=EPSG:4326",
-    "crs=http://www.opengis.net/def/crs/EPSG/0/2326",
+    "crs=http://www.opengis.net/def/crs/EPSG/0/99999",
+    "crs=http://www.opengis.net/def/crs/EPSG/0/5703",
+    "crs=EPSG:25832",
+    "bbox=0,0,1,1&bbox-crs=http://www.opengis.net/def/crs/EPSG/0/5703",
     "crs=",
     "datetime=",
     "datetime=../..",
