@@ -22,6 +22,7 @@ from app.formats.alignments.geometry import (
     StationEquation,
 )
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
+from app.formats.xml_tree import xml_head
 from app.roads.axis import Axis
 from app.roads.lane_line import CalibrationPoint, Measures, calibrate, cut_edges, parallel_line
 from app.values import Floats, JsonObject
@@ -303,7 +304,7 @@ def _detect_xml(root: str) -> Callable[[Sample], Confidence]:
     start = re.compile(rb"<(?:\w+:)?%s[\s/>]" % root.encode())
 
     def detect(sample: Sample) -> Confidence:
-        head = _head(sample)
+        head = xml_head(sample.data)
         return Confidence.CERTAIN if head.startswith(b"<") and start.search(head) else Confidence.NONE
 
     return detect

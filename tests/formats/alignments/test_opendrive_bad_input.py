@@ -59,7 +59,7 @@ def piece(shape: str, length: str = "50") -> bytes:
         (document()[:-20], "not XML"),
         (b"", "not XML"),
         (b'<OpenDRIVE><q:road id="1"/></OpenDRIVE>', "not XML: unbound prefix"),
-        (b'<?xml version="1.0" encoding="utf-77"?><OpenDRIVE/>', "not XML"),
+        (b'<?xml version="1.0" encoding="utf-77"?><OpenDRIVE/>', "declares the encoding 'utf-77'"),
         (b"\x00\xff" * 100, "not XML"),
         (b"<OpenDRIVE>" + b"<a>" * 200 + b"</a>" * 200 + b"</OpenDRIVE>", "nested too deeply"),
         (b'<!DOCTYPE o [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><OpenDRIVE>&b;</OpenDRIVE>', "document type"),
