@@ -32,7 +32,7 @@ def piece(shape: str, length: str = "50") -> bytes:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (piece("<line/>", "0"), "road 7, geometry at s 0: the length is 0 m"),
+        (piece("<line/>", "0"), "road 7: the planView has geometries of zero length only"),
         (piece("<line/>", "-3"), "road 7, geometry at s 0: the length is -3 m"),
         (piece("<line/>", "nan"), "road 7, geometry at s 0: length is 'nan'"),
         (piece("<line/>", "1e8"), "needs 1.5e+08 vertices"),
