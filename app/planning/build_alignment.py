@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
-from app.planning.alignment import Alignment, AlignmentDeclaration, AvoidedArea, Lane
+from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile, LaneGeometry
+from app.planning.alignment import Alignment, AvoidedArea, Lane
 from app.planning.road.events import find_events
 from app.planning.road.ground_line import DenseLine, GroundLine, densify, make_ground_line
 from app.planning.road.lanes import (

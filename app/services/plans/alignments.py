@@ -8,10 +8,10 @@ from datetime import timedelta
 from pydantic import TypeAdapter
 
 from app.errors import InvalidParameter
+from app.formats.alignments.geometry import AlignmentDeclaration
 from app.formats.alignments.read import RegisteredRoad, RoadLanes, write_registered_road
 from app.formats.format import SpooledFile
 from app.geodesy import LocalizationGrade
-from app.planning.alignment import AlignmentDeclaration
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
 from app.registry.plan_features import add_lanes

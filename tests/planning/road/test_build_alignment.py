@@ -11,6 +11,7 @@ from pyproj import CRS, Geod, Transformer
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.alignments.geometry import (
+    AlignmentDeclaration,
     AlignmentFile,
     AreaGeometry,
     EventGeometry,
@@ -18,7 +19,7 @@ from app.formats.alignments.geometry import (
     LaneGeometry,
 )
 from app.geodesy import LocalizationGrade
-from app.planning.alignment import Alignment, AlignmentDeclaration, Lane
+from app.planning.alignment import Alignment, Lane
 from app.planning.build_alignment import build_alignment
 from app.planning.rules import RoadRules
 
