@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -29,6 +30,8 @@ dm, US survey feet. Source: Autodesk DXF reference, "HEADER section group codes"
 _UNITLESS = 0
 _MAX_IN_BLOCKS = 200_000  # entities of block references, with those that are nested; bounds the time of a file
 _MAX_NESTED = 20  # levels of block references
+_HEADER_BYTES = 1 << 16  # [byte] in which $DWGCODEPAGE stands
+_CODE_PAGE = re.compile(rb"\$DWGCODEPAGE\s+3\s+(\w+)", re.ASCII)
 _SHOWN = 10  # names of layers in a message
 _HEAD_BYTES = 4096  # [byte] in which a binary file shows itself
 
@@ -128,13 +131,15 @@ def open_dxf(data: bytes) -> tuple[Any, tuple[str, float] | None]:
         It is no ASCII DXF, or has units that no survey has.
     """
     from ezdxf.filemanagement import read
+    from ezdxf.tools.codepage import toencoding
 
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:
         if b"\x00" in data[:_HEAD_BYTES]:
             raise _damaged("it is no ASCII DXF") from None
-        text = data.decode("cp1252", "replace")  # before R2007 in the code page of the system; numbers are ASCII
+        page = _CODE_PAGE.search(data[:_HEADER_BYTES])  # before R2007 texts are in the code page of the system
+        text = data.decode(toencoding(page[1].decode()) if page else "cp1252", "replace")
     document = read(io.StringIO(text, newline=None))
     code = document.header.get("$INSUNITS", _UNITLESS)
     if code == _UNITLESS:

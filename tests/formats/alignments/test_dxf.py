@@ -350,6 +350,20 @@ def test_multilines_are_reported() -> None:
     assert _read(document).warnings[0].startswith("2 multilines and ellipses are left out, the first on layer M")
 
 
+@pytest.mark.parametrize(
+    ("page", "encoding", "name"),
+    [("ANSI_936", "gbk", "车道"), ("ANSI_932", "cp932", "車線"), ("ANSI_1251", "cp1251", "Полоса")],
+)
+def test_names_of_old_drawings_are_in_their_code_page(page: str, encoding: str, name: str) -> None:
+    document = ezdxf.new("R2000")
+    document.modelspace().add_line((0, 0), (90, 0), dxfattribs={"layer": "LANE"})
+    stream = io.StringIO()
+    document.write(stream)
+    text = stream.getvalue().replace("ANSI_1252", page).replace("LANE", name)
+    (lane,) = read_alignment(text.encode(encoding)).lanes
+    assert lane.name == name
+
+
 # --- units ------------------------------------------------------------------------------------------------------------
 
 
