@@ -71,7 +71,7 @@ def plan(
     """
     from rich.console import Console
 
-    from app.planning.alignment import AlignmentDeclaration
+    from app.formats.alignments.geometry import AlignmentDeclaration
     from app.planning.outputs.drawing_sheet import TitleBlock
     from app.planning.outputs.package import PackageOptions
 
@@ -125,8 +125,8 @@ def _check_folder(out: Path) -> None:
 
 def _make(console: Console, road: Path, rules_file: Path, declaration: object, name: str) -> Plan:
     """Read, place and check, each with its line of progress."""
+    from app.formats.alignments.geometry import AlignmentDeclaration
     from app.formats.alignments.read import read_alignment
-    from app.planning.alignment import AlignmentDeclaration
     from app.planning.build_alignment import build_alignment
     from app.planning.planner import make_plan
     from app.planning.rules import read_rules
@@ -135,7 +135,7 @@ def _make(console: Console, road: Path, rules_file: Path, declaration: object, n
     with console.status("Reading the rules") as status:
         rules = read_rules(rules_file.read_bytes())
         status.update("Reading the road")
-        file = read_alignment(road.read_bytes(), road.name)
+        file = read_alignment(road.read_bytes(), road.name, declaration=declaration)
         status.update("Placing the road")
         alignment = build_alignment(file, rules.road, declaration, name=road.stem)
         made = make_plan(alignment, rules, name=name, report=status.update)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import math
+import re
 import xml.etree.ElementTree as ET
 from xml.parsers import expat
 
@@ -17,14 +19,101 @@ MAX_NUMBER = 1e9
 """Greatest number of a road file; it keeps cubes of polynomials finite. 25 times the equator."""
 
 
-def check_xml(data: bytes, *, max_elements: int, cure: str) -> None:
-    """Check a document in one pass that builds nothing: depth, number of elements, no document type.
+_DECLARATION = re.compile(r"""\s*<\?xml\s[^>]*?\bencoding\s*=\s*["']([\w.:-]{1,40})["'][^>]*\?>""")
+_HEAD_BYTES = 1024  # in which the XML declaration stands
+_ROOT_BYTES = 4096  # in which the root element stands
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"), (b"<\0", "utf-16-le"), (b"\0<", "utf-16-be"),
+)  # fmt: skip
+"""First bytes of documents whose encoding they show. Source: XML 1.0, appendix F."""
+_ALIASES = {
+    "gb2312": "gb18030",
+    "gbk": "gb18030",
+    "shift_jis": "cp932",
+    "x-sjis": "cp932",
+    "euc-kr": "cp949",
+    "ks_c_5601-1987": "cp949",
+    "us-ascii": "utf-8",
+}
+"""Encodings that contain the declared ones, as programs write them. Source: WHATWG Encoding, section 4.2."""
+_ENCODINGS = re.compile(
+    r"utf-8|gb18030|cp\d{3,4}|big5(hkscs)?|euc_jp|iso2022_jp|iso8859-\d+|koi8-[rtu]|mac-\w+|tis-620"
+)
+"""Encodings of text, by their names in Python; others (such as base64) are no encodings of documents."""
+
+
+def xml_encoding(data: bytes) -> str:
+    """Python's name of a document's encoding: by its first bytes, or as it declares; UTF-8 without either.
 
     Raises
     ------
     UnreadableUpload
-        It is no XML, has a document type, or is too deep or too large.
+        The declared encoding is not known.
     """
+    marked = next((name for mark, name in _MARKS if data.startswith(mark)), None)
+    declared = _DECLARATION.match(data[:_HEAD_BYTES].decode("latin-1")) if marked is None else None
+    if declared is None:
+        return marked or "utf-8"
+    try:
+        label = declared[1].lower().replace("windows-", "cp")
+        name = codecs.lookup(_ALIASES.get(label, label)).name
+    except LookupError:
+        name = ""
+    if name.startswith(("utf-16", "utf-32")):  # one byte a character was just read: texts of .NET that are UTF-8
+        return "utf-8"
+    if _ENCODINGS.fullmatch(name) is None:
+        raise UnreadableUpload(
+            f"the XML declares the encoding {declared[1]!r}, which is not known",
+            field="file",
+            limit="UTF-8, UTF-16, ISO-8859, Windows, GB, Big5, Shift_JIS, EUC and KOI8 encodings",
+            cure="save the file in UTF-8",
+        )
+    return name
+
+
+def xml_head(data: bytes) -> bytes:
+    """The beginning of a document in UTF-8, to see what it is."""
+    head = data[:_ROOT_BYTES]
+    try:
+        return head.decode(xml_encoding(head), "ignore").lstrip().encode()
+    except UnreadableUpload:
+        return head.lstrip()
+
+
+def _in_utf8(data: bytes) -> bytes:
+    """A document in UTF-8, without the declaration of another encoding. Expat knows no encodings of several bytes."""
+    name = xml_encoding(data)
+    head = _DECLARATION.match(data[:_HEAD_BYTES].removeprefix(codecs.BOM_UTF8).decode("latin-1"))
+    if name.startswith("utf-8") and (head is None or head[1].lower() == "utf-8"):
+        return data
+    try:
+        text = data.decode(name)
+    except UnicodeDecodeError as error:
+        raise UnreadableUpload(
+            f"the XML is declared to be in {head[1] if head else name}, and byte {error.start + 1} is not",
+            field="file",
+            limit="text in the encoding that it declares",
+            cure="save the file in UTF-8",
+        ) from error
+    declared = _DECLARATION.match(text)
+    return text[declared.end() if declared else 0 :].encode()
+
+
+def check_xml(data: bytes, *, max_elements: int, cure: str) -> bytes:
+    """Check a document in one pass that builds nothing: depth, number of elements, no document type.
+
+    Returns
+    -------
+    bytes
+        The document in UTF-8.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no XML, has a document type or an unknown encoding, or is too deep or too large.
+    """
+    data = _in_utf8(data)
     depth = count = 0
 
     def refuse(*_: object) -> None:
@@ -54,7 +143,21 @@ def check_xml(data: bytes, *, max_elements: int, cure: str) -> None:
     try:
         parser.Parse(data, True)
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: unknown encodings
-        raise UnreadableUpload(f"not XML: {error}", field="file", limit="XML 1.0", cure="export it again") from error
+        message, cure = f"not XML: {error}", "export it again"
+        if (wrong := _not_utf8(data)) is not None:
+            message = f"not XML: byte {wrong + 1} is not UTF-8, and the file declares no other encoding"
+            cure = "save the file in UTF-8, or state its encoding in its first line"
+        raise UnreadableUpload(message, field="file", limit="XML 1.0", cure=cure) from error
+    return data
+
+
+def _not_utf8(data: bytes) -> int | None:
+    """Place of the first byte that is not UTF-8."""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return error.start
+    return None
 
 
 def parse_xml(data: bytes, root: str) -> ET.Element:
@@ -74,8 +177,7 @@ def parse_xml(data: bytes, root: str) -> ET.Element:
         raise UploadTooLarge(
             f"the file has {len(data)} bytes", field="file", limit=f"{MAX_BYTES} bytes", cure="cut the road into parts"
         )
-    check_xml(data, max_elements=MAX_ELEMENTS, cure="cut the road into parts")
-    tree = ET.fromstring(data)
+    tree = ET.fromstring(check_xml(data, max_elements=MAX_ELEMENTS, cure="cut the road into parts"))
     for element in tree.iter():
         element.tag = local_name(element.tag)
     if tree.tag != root:

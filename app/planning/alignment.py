@@ -2,99 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, with_config
 from pyproj import Geod
 
-from app.errors import InvalidParameter
 from app.formats.alignments.geometry import BoundaryStyle, EventKind, StationEquation
-from app.formats.surveys.declaration import METRES, Unit
-from app.geodesy import LocalizationGrade, check_lon_lat, grade_accuracy
-from app.geodesy.systems import VerticalDatum
-from app.inputs import INPUT, Flag, Number, Text
+from app.geodesy import LocalizationGrade, grade_accuracy
 from app.values import Floats
-
-# === What is declared of a file with a road, as for surveys: CRS, realization, epoch, heights, units, or an origin.
-
-
-MAX_EPOCH = (1900.0, 2100.0)
-"""Plausible coordinate epochs. [decimal year]"""
-
-
-@with_config(INPUT)
-@dataclass(frozen=True, slots=True)
-class AlignmentDeclaration:
-    """What is declared of a file with a road; what the file states may be left out."""
-
-    # one that contradicts the file is an error
-    crs: Annotated[Text | None, Field(max_length=64, examples=["EPSG:25832"])] = None
-    realization: Annotated[Text | None, Field(max_length=64, examples=["ITRF2014"])] = None
-    epoch: Annotated[Number | None, Field(ge=MAX_EPOCH[0], le=MAX_EPOCH[1], description="Decimal year.")] = None
-    vertical_datum: Annotated[
-        VerticalDatum | None,
-        Field(
-            examples=["ellipsoid"],
-            description="`ellipsoid`, or the datum of the heights; needed where a file with a CRS has heights.",
-        ),
-    ] = None
-    # `unit`, `height_unit`: those of the file or of its CRS without
-    unit: Unit | None = None
-    height_unit: Unit | None = None
-    ignore_heights: Flag = False
-    origin: Annotated[
-        tuple[Number, Number] | None,
-        Field(description="Longitude and latitude of the origin of local coordinates. Such a road is not surveyed."),
-    ] = None
-    bearing_deg: Annotated[
-        Number, Field(ge=-360, le=360, description="Direction of the local y axis; only with `origin`. [deg]")
-    ] = 0.0
-
-    def __post_init__(self) -> None:
-        for field, value in (("unit", self.unit), ("height_unit", self.height_unit)):
-            if value not in (None, *METRES):
-                raise InvalidParameter(
-                    f"there is no unit {str(value)[:40]!r}",
-                    field=field,
-                    limit=", ".join(METRES),
-                    cure="declare another",
-                )
-        if self.epoch is not None and not MAX_EPOCH[0] <= self.epoch <= MAX_EPOCH[1]:
-            raise InvalidParameter(
-                f"the epoch is {self.epoch}",
-                field="epoch",
-                limit=f"{MAX_EPOCH[0]:g} to {MAX_EPOCH[1]:g}",
-                cure="declare the epoch as a decimal year, e.g. 2010.0",
-            )
-        if not math.isfinite(self.bearing_deg) or abs(self.bearing_deg) > 360:
-            raise InvalidParameter(
-                f"the bearing is {self.bearing_deg}",
-                field="bearing_deg",
-                limit="-360 to 360 deg",
-                cure="declare another",
-            )
-        if self.origin is not None:
-            check_lon_lat(*self.origin, field="origin")
-        if self.origin is not None and self.crs is not None:
-            raise InvalidParameter(
-                "both a CRS and an origin are declared",
-                field="origin",
-                limit="one of the two",
-                cure="declare crs for coordinates on Earth, origin for local ones",
-            )
-        if self.origin is None and self.bearing_deg:
-            raise InvalidParameter(
-                "a bearing is declared without an origin",
-                field="bearing_deg",
-                limit="only with origin",
-                cure="declare the origin that the road is turned about",
-            )
-
 
 # === The road that a plan is made for.
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
-from app.planning.alignment import Alignment, AlignmentDeclaration, AvoidedArea, Lane
+from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile, LaneGeometry
+from app.planning.alignment import Alignment, AvoidedArea, Lane
 from app.planning.road.events import find_events
-from app.planning.road.ground_line import DenseLine, GroundLine, densify, make_ground_line
+from app.planning.road.ground_line import MAX_DEG, DenseLine, GroundLine, densify, make_ground_line
 from app.planning.road.lanes import (
     check_curvature,
     check_length,
@@ -200,6 +200,13 @@ def _place(
     if flat:
         vertices[:, 2] = np.nan
     road = reference.place(vertices, accuracy_m)
+
+    def is_inside_exchanged() -> bool:
+        exchanged = vertices[:, [1, 0, 2]]
+        if reference.geographic and not (np.abs(exchanged[:, 1]) <= MAX_DEG[1]).all():
+            return False
+        return bool(np.isfinite(reference.place(exchanged, accuracy_m).lon_deg).all())
+
     ends = np.cumsum([len(part) for part in parts]).tolist()
     spans = [slice(end - len(part), end) for end, part in zip(ends, parts, strict=True)]
     grounds = []
@@ -208,7 +215,7 @@ def _place(
         found = []
         for line in own_lines:
             span = spans[position]
-            check_line(one.name, road.lon_deg[span], vertices[span], line.index, reference.name)
+            check_line(one.name, road.lon_deg[span], vertices[span], line.index, reference.name, is_inside_exchanged)
             found.append(
                 make_ground_line(road.lon_deg[span], road.lat_deg[span], road.height_m[span], line.index, one.name)
             )

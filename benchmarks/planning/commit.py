@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from app.families.surveys import MarkerRules
+from app.formats.alignments.geometry import AlignmentDeclaration
 from app.formats.format import SpooledFile
-from app.planning.alignment import AlignmentDeclaration
 from app.registry.database import Database
 from app.registry.engines import across_agencies
 from app.services.access.access import Access, Scope

@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+from app.formats.alignments.geometry import AlignmentDeclaration
 from app.formats.alignments.read import read_alignment
-from app.planning.alignment import AlignmentDeclaration
 from app.planning.build_alignment import build_alignment
 from app.planning.plan import Plan
 from app.planning.planner import make_plan
@@ -85,7 +85,8 @@ def _plan_of(example: Example) -> Plan:
     rules = read_rules((_ROOT / example.rules).read_bytes())
     path = _ROOT / example.road
     declaration = AlignmentDeclaration(origin=_ORIGIN_DEG, ignore_heights=True)
-    road = build_alignment(read_alignment(path.read_bytes(), path.name), rules.road, declaration, name=path.stem)
+    file = read_alignment(path.read_bytes(), path.name, declaration=declaration)
+    road = build_alignment(file, rules.road, declaration, name=path.stem)
     return make_plan(road, rules, name=example.name)
 
 

@@ -38,10 +38,10 @@ from app.api.http.responses import (
 from app.api.http.routes import Router
 from app.api.markers.searches import Filtered
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.formats.alignments.geometry import AlignmentDeclaration
 from app.formats.alignments.read import RoadLanes
 from app.formats.format import SpooledFile
 from app.inputs import Identifier, StrictModel, Text
-from app.planning.alignment import AlignmentDeclaration
 from app.services.idempotency import IdempotencyKey
 from app.services.plans.alignments import Alignments
 from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile

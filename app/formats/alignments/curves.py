@@ -20,6 +20,8 @@ widths, are linear between vertices."""
 GAP_WARNING_M, GAP_ERROR_M = 0.01, 0.10
 """Distance between the end of an element and the start of the next one. [m] The accuracy of a good survey, and the
 accuracy at which a marker still lies in its lane."""
+NO_LENGTH_M = 1e-4
+"""Shorter elements have no direction and are left out. [m] The last digit in which most programs write coordinates."""
 MAX_SPIRAL_TURN_RAD = 4.0 * np.pi
 """A clothoid turns by less. [rad] The quadrature is exact to 1e-12 of its length."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)

@@ -2,7 +2,7 @@
 
 A layer that is named after areas (joints, manholes, crossings, bridges) or after events (stop_line, arrow, ...) holds
 these; every other layer holds lanes. A layer whose name ends with left or right holds boundaries of the lane that the
-rest of the name gives.
+rest of the name gives. Layers of bound external references are named ``plan$0$LANE``; the part after the last $ counts.
 """
 
 from __future__ import annotations
@@ -30,17 +30,33 @@ from app.formats.alignments.features import (
     normalize_kind,
     turned_part,
 )
-from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_VERTICES, AlignmentFile
-from app.formats.surveys.declaration import FEET, METRES
-from app.formats.surveys.dxf_reader import open_dxf, reading_dxf
+from app.formats.alignments.geometry import (
+    CHORD_ERROR_M,
+    MAX_VERTICES,
+    AlignmentDeclaration,
+    AlignmentFile,
+    unit_length_m,
+)
+from app.formats.surveys.declaration import METRES
+from app.formats.surveys.dxf_reader import drawn_entities, hidden_layers, open_dxf, reading_dxf
 from app.values import Floats
 
 NAME_DISTANCE_M = 10.0
 """Farthest distance of a text from the line that it names. [m] Three lane widths."""
 _SIDE = re.compile(r"(?P<lane>.*?)[ _.:-]*(?P<side>left|right|_l|_r|-l|-r)", re.IGNORECASE)
-_LINES = "LINE ARC CIRCLE LWPOLYLINE POLYLINE"
+_BOUND = re.compile(r".*\$[0-9]+\$")  # in names of layers: where an external reference was bound
+_LINES = frozenset({"LINE", "ARC", "CIRCLE", "LWPOLYLINE", "POLYLINE"})
+_LABELS = frozenset({"TEXT", "MTEXT", "INSERT", "POINT"})
 _FLAT = 1e-6  # [unit] rise of an arc above its chord below which it is a line; source: far below a survey's accuracy
-_OTHER_CURVES = ("SPLINE", "ELLIPSE", "HELIX")
+_OTHER_CURVES = {
+    "SPLINE": "splines", "ELLIPSE": "ellipses", "HELIX": "helices", "MLINE": "multilines",
+    "ACAD_PROXY_ENTITY": "objects of other programs", "AECC_ALIGNMENT": "Civil 3D alignments",
+}  # fmt: skip
+SYMBOL_M = 5.0
+"""Blocks whose drawing is smaller are symbols, whose lines are no lanes. [m] Source: as the shortest lane,
+`app.planning.build_alignment`."""
+_SYMBOL_ENTITIES = 200  # greatest number in a block that can be a symbol; bounds the time of measuring it
+_FRAME = 16  # flag of vertices of the frame of a spline, which are not on the line; source: DXF reference, VERTEX
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +79,78 @@ class _Label:
     point: tuple[float, float, float]
 
 
-def read_dxf(data: bytes) -> AlignmentFile:
+class _Blocks:
+    """Which block references are opened for the lines in them, and what is reported of the others."""
+
+    def __init__(self, unit_m: float) -> None:
+        self.unit_m = unit_m
+        self.symbols: list[str] = []
+        self.external: list[str] = []
+        self.clipped: list[str] = []
+        self._sizes: dict[str, float] = {}  # [unit] of blocks that can be symbols, infinite for others
+
+    def is_opened(self, insert: Any, layer: str) -> bool:
+        from ezdxf.xclip import XClip
+
+        kind, name, block = normalize_kind(_own_name(layer)), str(insert.dxf.name), insert.block()
+        if kind in EVENT_KINDS:
+            return False  # the reference itself is the event
+        if block.block.is_xref or block.block.is_xref_overlay:
+            self.external.append(name)
+            return False
+        if name not in self._sizes:
+            self._sizes[name] = _symbol_size(block)
+        scale = max(abs(insert.dxf.get(axis, 1.0)) for axis in ("xscale", "yscale"))
+        if self._sizes[name] * scale * self.unit_m < SYMBOL_M and area_kind(kind) not in AREA_KINDS:
+            self.symbols.append(name)
+            return False
+        clip = XClip(insert)
+        if clip.has_clipping_path and clip.is_clipping_enabled:
+            self.clipped.append(name)
+        return True
+
+    def notes(self) -> Iterator[str]:
+        """Sentences about what is left out."""
+        if self.external:
+            yield (
+                f"{len(self.external)} references to other drawings are left out, the first is "
+                f"{self.external[0][:80]}; bind them (XREF, Bind) and export the drawing again."
+            )
+        if self.symbols:
+            yield (
+                f"{len(self.symbols)} block references are smaller than {SYMBOL_M:g} m and are taken as symbols; lines "
+                f"in them are left out. The first is {self.symbols[0][:80]}."
+            )
+        if self.clipped:
+            yield (
+                f"{len(self.clipped)} block references are clipped (XCLIP), the first is {self.clipped[0][:80]}; they "
+                "were read whole."
+            )
+
+
+def _symbol_size(block: Any) -> float:
+    """Diagonal of a block; infinite if it cannot be a symbol, because of its size or of layers of areas or events."""
+    from ezdxf import bbox
+
+    if len(block) > _SYMBOL_ENTITIES:
+        return math.inf
+    kinds = {normalize_kind(_own_name(str(entity.dxf.layer))) for entity in block}
+    if any(kind in EVENT_KINDS or area_kind(kind) in AREA_KINDS for kind in kinds):
+        return math.inf
+    box = bbox.extents((entity for entity in block if entity.dxftype() in _LINES | {"INSERT"}), fast=True)
+    return float(box.size.magnitude) if box.has_data else 0.0
+
+
+def _own_name(layer: str) -> str:
+    """Name of a layer in the drawing that it is from."""
+    return _BOUND.sub("", layer) or layer
+
+
+def read_dxf(data: bytes, declaration: AlignmentDeclaration | None = None) -> AlignmentFile:
     """A road of the model space. Lines and arcs that meet end to end are one lane; texts name the nearest line.
+
+    Blocks are read where they are inserted, except symbols. What CAD does not draw, on frozen or switched-off layers,
+    is left out. A declared unit counts more than $INSUNITS, as for surveys.
 
     Raises
     ------
@@ -73,23 +159,41 @@ def read_dxf(data: bytes) -> AlignmentFile:
     InvalidParameter
         A geometry cannot be used; the message names the layer.
     """
+    declaration = declaration or AlignmentDeclaration()
+    paths: list[_Path] = []
+    labels: list[_Label] = []
+    others: list[tuple[str, str]] = []
+    hidden: set[str] = set()
     with reading_dxf():
         document, unit = open_dxf(data)
-        unit_m = None if unit is None else METRES["ft-intl" if unit[0] == FEET else unit[0]] * unit[1]
-        space = document.modelspace()
-        paths = [path for entity in space.query(_LINES) for path in _paths(entity, unit_m or 1.0)]
+        unit_m, notes = _unit(document, unit, declaration)
+        blocks = _Blocks(unit_m or 1.0)
+        for entity, layer in drawn_entities(
+            document, _LINES | _LABELS | _OTHER_CURVES.keys(), blocks.is_opened, hidden
+        ):
+            kind, own = entity.dxftype(), _own_name(layer)
+            if kind in _LINES:
+                paths += _paths(entity, own, unit_m or 1.0)
+            elif kind in _LABELS:
+                labels.append(_label(entity, own))
+            else:
+                others.append((kind, own))
         for path in paths:
             check_vertices(path.vertices, f"layer {path.layer}")
-        labels = list(_labels(space))
-        others = [entity.dxf.layer for entity in space.query(" ".join(_OTHER_CURVES))]
     check_counts(len(paths) + len(labels), sum(len(path.vertices) for path in paths))
-    notes = []
-    if unit is None:
-        notes.append("the DXF states no unit ($INSUNITS); that of the CRS is used, or metres")
+    notes += blocks.notes()
+    if hidden:
+        notes.append(hidden_layers(hidden))
+        if not paths:
+            raise UnreadableUpload(
+                f"the DXF has no lines that are drawn. {notes[-1]}",
+                field="file",
+                limit="lines on layers that are drawn",
+                cure="thaw and switch on the layers of the lanes, and export the drawing again",
+            )
     if others:
-        notes.append(
-            f"{len(others)} splines and ellipses are left out, the first on layer {others[0]}; export them as polylines"
-        )
+        kinds = " and ".join(dict.fromkeys(_OTHER_CURVES[kind] for kind, _layer in others))
+        notes.append(f"{len(others)} {kinds} are left out, the first on layer {others[0][1]}; export them as polylines")
     features = list(_features(paths, labels, unit_m or 1.0))
     return assemble_road("dxf", features, unit_m=unit_m, warnings=notes)
 
@@ -97,13 +201,29 @@ def read_dxf(data: bytes) -> AlignmentFile:
 # --- entities ---------------------------------------------------------------------------------------------------------
 
 
-def _paths(entity: Any, unit_m: float) -> Iterator[_Path]:
-    kind, layer = entity.dxftype(), str(entity.dxf.layer)
+def _unit(
+    document: Any, unit: tuple[str, float] | None, declaration: AlignmentDeclaration
+) -> tuple[float | None, list[str]]:
+    """Length of the drawing's unit [m], and notes on it."""
+    if unit is None:
+        note = "the DXF states no unit ($INSUNITS); that of the CRS is used, or metres"
+        return (METRES[declaration.unit], []) if declaration.unit is not None else (None, [note])
+    stated_m, notes = unit_length_m(unit, declaration, None)
+    if declaration.unit is None or abs(stated_m / METRES[declaration.unit] - 1) < 1e-9:
+        return stated_m, notes
+    return METRES[declaration.unit], [
+        f"The unit of the drawing is {stated_m:.9g} m ($INSUNITS {document.header['$INSUNITS']}); the coordinates were "
+        f"read in the declared unit, {declaration.unit}."
+    ]
+
+
+def _paths(entity: Any, layer: str, unit_m: float) -> Iterator[_Path]:
+    kind = entity.dxftype()
     if kind == "LINE":
         ends = np.array([entity.dxf.start, entity.dxf.end], dtype=np.float64)
         yield _Path(layer, ends, np.zeros(2), True, False)
         return
-    mirrored = _is_mirrored(entity)
+    mirrored = _is_mirrored(entity, layer)
     if kind in ("ARC", "CIRCLE"):
         start, end = (entity.dxf.start_angle, entity.dxf.end_angle) if kind == "ARC" else (0.0, 360.0)
         turn = math.radians((end - start) % 360.0 or 360.0)
@@ -127,8 +247,9 @@ def _polyline(entity: Any) -> tuple[Floats, Floats, bool]:
     else:
         if not (entity.is_2d_polyline or entity.is_3d_polyline):
             return np.zeros((0, 3)), np.zeros(0), False  # a mesh
-        points = np.array([vertex.dxf.location for vertex in entity.vertices], dtype=np.float64).reshape(-1, 3)
-        bulges = np.array([vertex.dxf.get("bulge", 0.0) for vertex in entity.vertices], dtype=np.float64)
+        on_line = [vertex for vertex in entity.vertices if not vertex.dxf.flags & _FRAME]
+        points = np.array([vertex.dxf.location for vertex in on_line], dtype=np.float64).reshape(-1, 3)
+        bulges = np.array([vertex.dxf.get("bulge", 0.0) for vertex in on_line], dtype=np.float64)
         if entity.is_2d_polyline:
             points[:, 2] = float(entity.dxf.elevation[2])
     closed = bool(entity.is_closed)
@@ -137,12 +258,12 @@ def _polyline(entity: Any) -> tuple[Floats, Floats, bool]:
     return points, bulges, closed
 
 
-def _is_mirrored(entity: Any) -> bool:
+def _is_mirrored(entity: Any, layer: str) -> bool:
     """Whether its plane is seen from below: AutoCAD's MIRROR draws polylines so."""
     x, y, z = entity.dxf.get("extrusion", (0.0, 0.0, 1.0))
     if abs(x) > 1e-6 or abs(y) > 1e-6:
         raise UnreadableUpload(
-            f"the DXF has a {entity.dxftype()} on layer {entity.dxf.layer} that does not lie flat",
+            f"the DXF has a {entity.dxftype()} on layer {layer} that does not lie flat",
             field="file",
             limit="entities in plan",
             cure="flatten the drawing, or export it with 3D polylines",
@@ -193,19 +314,18 @@ def _arc(centre: Floats, radius: float, start_rad: float, turn_rad: float, unit_
     return np.column_stack([flat, np.full(len(flat), centre[2])])
 
 
-def _labels(space: Any) -> Iterator[_Label]:
-    for entity in space.query("TEXT MTEXT INSERT POINT"):
-        kind = entity.dxftype()
-        if kind == "INSERT":
-            values = {str(attribute.dxf.tag).lower(): str(attribute.dxf.text) for attribute in entity.attribs}
-            text = values.get("value", "")
-        elif kind == "POINT":
-            text = ""
-        else:
-            text = entity.plain_text() if kind == "MTEXT" else entity.dxf.text
-        place = entity.dxf.location if kind == "POINT" else entity.dxf.insert
-        point = (float(place[0]), float(place[1]), float(place[2]))
-        yield _Label(str(entity.dxf.layer), " ".join(str(text).split())[:120], point)
+def _label(entity: Any, layer: str) -> _Label:
+    kind = entity.dxftype()
+    if kind == "INSERT":
+        values = {str(attribute.dxf.tag).lower(): str(attribute.dxf.text) for attribute in entity.attribs}
+        text = values.get("value", "")
+    elif kind == "POINT":
+        text = ""
+    else:
+        text = entity.plain_text() if kind == "MTEXT" else entity.dxf.text
+    place = entity.dxf.location if kind == "POINT" else entity.dxf.insert
+    point = (float(place[0]), float(place[1]), float(place[2]))
+    return _Label(layer, " ".join(str(text).split())[:120], point)
 
 
 # --- features ---------------------------------------------------------------------------------------------------------

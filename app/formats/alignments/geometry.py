@@ -1,4 +1,4 @@
-"""What a file with a road contains, in the coordinates of the file: lines, events and areas.
+"""What a file with a road contains, in the coordinates of the file: lines, events, areas; and what is declared of it.
 
 Every reader returns an `AlignmentFile`. `app.planning.build_alignment` turns it into lanes in WGS 84.
 """
@@ -9,10 +9,17 @@ import math
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
+from pydantic import Field, with_config
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
+from app.errors import InvalidParameter
+from app.formats.surveys.declaration import FEET, METRES, Unit, choose_foot
+from app.geodesy import check_lon_lat, normalize_crs, reference_system
+from app.geodesy.systems import VerticalDatum
+from app.inputs import INPUT, Flag, Number, Text
 from app.values import Floats
 
 MAX_VERTICES = 2_000_000
@@ -130,6 +137,110 @@ class AlignmentFile:
     start_station_m: float = 0.0  # [m] displayed station of the start of the reference line
     warnings: tuple[str, ...] = ()  # what was left out or repaired, in sentences for people
     earlier: EarlierTransformation | None = None  # of all coordinates, before they came into the file
+
+
+# === What is declared of a file with a road, as for surveys: CRS, realization, epoch, heights, units, or an origin.
+
+
+MAX_EPOCH = (1900.0, 2100.0)
+"""Plausible coordinate epochs. [decimal year]"""
+
+
+@with_config(INPUT)
+@dataclass(frozen=True, slots=True)
+class AlignmentDeclaration:
+    """What is declared of a file with a road; what the file states may be left out."""
+
+    # one that contradicts the file is an error
+    crs: Annotated[Text | None, Field(max_length=64, examples=["EPSG:25832"])] = None
+    realization: Annotated[Text | None, Field(max_length=64, examples=["ITRF2014"])] = None
+    epoch: Annotated[Number | None, Field(ge=MAX_EPOCH[0], le=MAX_EPOCH[1], description="Decimal year.")] = None
+    vertical_datum: Annotated[
+        VerticalDatum | None,
+        Field(
+            examples=["ellipsoid"],
+            description="`ellipsoid`, or the datum of the heights; needed where a file with a CRS has heights.",
+        ),
+    ] = None
+    # `unit`, `height_unit`: those of the file or of its CRS without
+    unit: Unit | None = None
+    height_unit: Unit | None = None
+    ignore_heights: Flag = False
+    origin: Annotated[
+        tuple[Number, Number] | None,
+        Field(description="Longitude and latitude of the origin of local coordinates. Such a road is not surveyed."),
+    ] = None
+    bearing_deg: Annotated[
+        Number, Field(ge=-360, le=360, description="Direction of the local y axis; only with `origin`. [deg]")
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        for field, value in (("unit", self.unit), ("height_unit", self.height_unit)):
+            if value not in (None, *METRES):
+                raise InvalidParameter(
+                    f"there is no unit {str(value)[:40]!r}",
+                    field=field,
+                    limit=", ".join(METRES),
+                    cure="declare another",
+                )
+        if self.epoch is not None and not MAX_EPOCH[0] <= self.epoch <= MAX_EPOCH[1]:
+            raise InvalidParameter(
+                f"the epoch is {self.epoch}",
+                field="epoch",
+                limit=f"{MAX_EPOCH[0]:g} to {MAX_EPOCH[1]:g}",
+                cure="declare the epoch as a decimal year, e.g. 2010.0",
+            )
+        if not math.isfinite(self.bearing_deg) or abs(self.bearing_deg) > 360:
+            raise InvalidParameter(
+                f"the bearing is {self.bearing_deg}",
+                field="bearing_deg",
+                limit="-360 to 360 deg",
+                cure="declare another",
+            )
+        if self.origin is not None:
+            check_lon_lat(*self.origin, field="origin")
+        if self.origin is not None and self.crs is not None:
+            raise InvalidParameter(
+                "both a CRS and an origin are declared",
+                field="origin",
+                limit="one of the two",
+                cure="declare crs for coordinates on Earth, origin for local ones",
+            )
+        if self.origin is None and self.bearing_deg:
+            raise InvalidParameter(
+                "a bearing is declared without an origin",
+                field="bearing_deg",
+                limit="only with origin",
+                cure="declare the origin that the road is turned about",
+            )
+
+
+def unit_length_m(
+    unit: tuple[str, float], declaration: AlignmentDeclaration, crs: str | None
+) -> tuple[float, list[str]]:
+    """Length of a unit that a file states, and a note if it is a foot of which the file does not state which. [m]
+
+    Parameters
+    ----------
+    unit : tuple
+        One of `METRES` or `FEET`, and how many of it the unit is.
+    crs : str or None
+        That of the file.
+    """
+    name, count = unit
+    if name != FEET:
+        return METRES[name] * count, []
+    stated = crs or declaration.crs
+    system = reference_system(normalize_crs(stated)) if stated is not None and declaration.origin is None else None
+    is_projected = system is not None and system.is_projected
+    own_m = float(system.axis_info[0].unit_conversion_factor) if system is not None and is_projected else 1.0
+    foot, of_crs = choose_foot(declaration.unit, own_m)
+    why = f"the unit of {system.name}" if system is not None and of_crs else "because the CRS is not in feet"
+    note = (
+        f"The file is in feet without stating which; they were read as {foot}, {why}. If this is wrong, declare unit "
+        "ft-us or ft-intl; they differ by 2 ppm, a metre in 500 km."
+    )
+    return METRES[foot] * count, [note] if foot != declaration.unit else []
 
 
 # === Whether what a file states as its reference system places its coordinates on Earth.

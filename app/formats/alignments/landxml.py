@@ -13,6 +13,7 @@ import numpy as np
 from app.errors import ReferenceSystemError, UnreadableUpload
 from app.formats.alignments.curves import GAP_WARNING_M as GAP_M
 from app.formats.alignments.curves import (
+    NO_LENGTH_M,
     Curve,
     Piece,
     Profile,
@@ -23,16 +24,27 @@ from app.formats.alignments.curves import (
     report_gap,
     sample,
 )
-from app.formats.alignments.geometry import MAX_VERTICES, AlignmentFile, LaneGeometry, StationEquation
+from app.formats.alignments.geometry import (
+    MAX_VERTICES,
+    AlignmentDeclaration,
+    AlignmentFile,
+    LaneGeometry,
+    StationEquation,
+    unit_length_m,
+)
+from app.formats.surveys.declaration import FEET
 from app.formats.xml_tree import attribute, finite_number, parse_xml
 from app.geodesy import reference_system
 from app.values import Floats, Ints
 
-UNITS_M = {
-    "millimeter": 0.001, "centimeter": 0.01, "meter": 1.0, "kilometer": 1000.0, "inch": 0.0254, "foot": 0.3048,
-    "ussurveyfoot": 1200 / 3937, "mile": 1609.344,
+UNITS = {
+    "millimeter": ("m", 0.001), "centimeter": ("m", 0.01), "meter": ("m", 1.0), "kilometer": ("m", 1000.0),
+    "inch": (FEET, 1 / 12), "foot": (FEET, 1.0), "ussurveyfoot": ("ft-us", 1.0), "mile": (FEET, 5280.0),
 }  # fmt: skip
-"""Length of linear units. [m] Source: LandXML 1.2, metLinear and impLinear; NIST SP 811, appendix B."""
+"""Unit of length of each linear unit, and how many of it that is. Source: LandXML 1.2, metLinear and impLinear."""
+_CLEARLY = 0.25  # of two misfits the smaller one decides if it is less than this part of the other
+_NOTHING = 1e-3  # smaller misfits decide nothing, in rad or as a part of the length; coordinates are rounded
+_TANGENT_RAD = 0.01  # lines and curves that meet with a smaller angle are tangents
 _CURE = "correct the element at this place, or export the alignment again"
 Point = tuple[float, float]
 """Easting and northing from the origin of the file. [m]"""
@@ -65,11 +77,13 @@ class _Scale:
         return (finite_number(easting, "the easting", place) - self.origin[1]) * self.unit_m, north * self.unit_m
 
 
-def read_landxml(data: bytes) -> AlignmentFile:
+def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -> AlignmentFile:
     """One lane for each alignment, along its line, with heights from its first profile.
 
-    Ends of elements are trusted, their directions (dir, dirStart) are not. Geometry and profile are in true distance;
-    station equations only change what is displayed. Equations and start station are those of the first alignment.
+    Ends of elements are trusted, their directions (dir, dirStart) are not. Curves and spirals turn to the side that
+    their length, PI and neighbours show, also against `rot`. Feet are those of the declaration or of the CRS. Geometry
+    and profile are in true distance; station equations only change what is displayed. Equations and start station are
+    those of the first alignment.
 
     Returns
     -------
@@ -83,8 +97,9 @@ def read_landxml(data: bytes) -> AlignmentFile:
     """
     root = parse_xml(data, "LandXML")
     named = {point.get("name", ""): point.text or "" for point in root.iter("CgPoint")}
-    scale = _Scale(_unit_m(root), (0.0, 0.0), named)
-    warnings: list[str] = []
+    crs, problem = _crs(root)
+    unit_m, warnings = unit_length_m(_unit(root), declaration or AlignmentDeclaration(), crs)
+    scale = _Scale(unit_m, (0.0, 0.0), named)
     lanes: list[LaneGeometry] = []
     stations: list[tuple[float, tuple[StationEquation, ...]]] = []
     vertices = 0
@@ -99,6 +114,9 @@ def read_landxml(data: bytes) -> AlignmentFile:
             scale = _Scale(scale.unit_m, _first_point(shape, scale, place), named)
         start = attribute(element, "staStart", place, 0.0)
         curve = _curve(shape, scale, place, warnings)
+        if curve is None:
+            warnings.append(f"{place}: its elements have no length; it is left out.")
+            continue
         stations.append((start * scale.unit_m, _equations(element, start, curve.end_s, scale, place, warnings)))
         lane = _lane(curve, _profile(element, start, scale, place, warnings), scale, name)
         vertices += 0 if lane.station_m is None else len(lane.station_m)
@@ -106,10 +124,13 @@ def read_landxml(data: bytes) -> AlignmentFile:
             raise _wrong("the alignments need too many vertices", f"{MAX_VERTICES} vertices", "cut the file into parts")
         lanes.append(lane)
     if not lanes:
-        raise _wrong("the file has no alignment with a CoordGeom", "one or more", "export the alignments as well")
+        raise _wrong(
+            "the file has no alignment with a CoordGeom that has a length",
+            "one or more",
+            "export the alignments as well",
+        )
     if any(equations for _, equations in stations[1:]):
         warnings.append("Station equations of the second and further alignments are left out.")
-    crs, problem = _crs(root)
     return AlignmentFile(
         format="landxml",
         lanes=tuple(lanes),
@@ -126,14 +147,14 @@ def _wrong(message: str, limit: str, cure: str = _CURE) -> UnreadableUpload:
     return UnreadableUpload(message, field="file", limit=limit, cure=cure)
 
 
-def _unit_m(root: ET.Element) -> float:
+def _unit(root: ET.Element) -> tuple[str, float]:
     units = next((child for child in root.iterfind("Units/*") if child.get("linearUnit")), None)
     name = "" if units is None else units.get("linearUnit", "")
-    unit_m = UNITS_M.get(name.lower())
-    if unit_m is None:
+    unit = UNITS.get(name.lower())
+    if unit is None:
         state = f"the linear unit {name[:40]!r} is not known" if name else "the file states no linear unit"
-        raise _wrong(state, ", ".join(UNITS_M), "export the file with Units in metres or feet")
-    return unit_m
+        raise _wrong(state, ", ".join(UNITS), "export the file with Units in metres or feet")
+    return unit
 
 
 def _crs(root: ET.Element) -> tuple[str | None, str | None]:
@@ -163,9 +184,27 @@ def _first_point(shape: ET.Element, scale: _Scale, place: str) -> tuple[float, f
     return point[1] / scale.unit_m, point[0] / scale.unit_m
 
 
-def _curve(shape: ET.Element, scale: _Scale, place: str, warnings: list[str]) -> Curve:
-    pieces: list[Piece] = []
-    ends: list[Point] = []
+@dataclass(slots=True)
+class _Shape:
+    """An element of a CoordGeom."""
+
+    place: str  # for errors and warnings
+    # pieces with the stated ends; of a curve or spiral twice: turned as `rot` states, and to the other side
+    sides: list[list[tuple[Piece, Point]]]
+    side: int = 0  # which of them is used
+    decided: bool = True  # whether the geometry shows the side, not only `rot`
+    stated: bool = True  # whether there is a `rot`
+
+    def heading(self, side: int, at_end: bool) -> float:
+        """Direction at its start or end. [rad]"""
+        piece, _stop = self.sides[side][-1 if at_end else 0]
+        return piece.hdg + at_end * piece.length * (piece.k0 + piece.k1) / 2.0
+
+
+def _curve(shape: ET.Element, scale: _Scale, place: str, warnings: list[str]) -> Curve | None:
+    """The line of a CoordGeom; None if none of its elements has a length."""
+    shapes: list[_Shape] = []
+    empty = 0
     s = 0.0
     for child in shape:
         where = f"{place}, {child.tag} at {s / scale.unit_m:.3f} from its start"
@@ -177,10 +216,23 @@ def _curve(shape: ET.Element, scale: _Scale, place: str, warnings: list[str]) ->
         start, end = scale.point(child, "Start", where), scale.point(child, "End", where)
         if start is None or end is None:
             raise _wrong(f"{where}: Start or End is missing", "Start and End")
-        for piece, stop in _READERS[child.tag](child, start, end, scale, where):
-            pieces.append(piece._replace(s=s))
-            ends.append(stop)
-            s += piece.length
+        if math.dist(start, end) < NO_LENGTH_M and _has_no_length(child, scale, where):
+            empty += 1
+            continue
+        shapes.append(_READERS[child.tag](child, start, end, scale, where, warnings))
+        s += sum(piece.length for piece, _stop in shapes[-1].sides[0])
+    if empty:
+        warnings.append(f"{place}: {empty} elements of zero length are left out.")
+    if not shapes:
+        return None
+    _choose_sides(shapes, place, warnings)
+    pieces: list[Piece] = []
+    ends: list[Point] = []
+    s = 0.0
+    for piece, stop in (one for found in shapes for one in found.sides[found.side]):
+        pieces.append(piece._replace(s=s))
+        ends.append(stop)
+        s += piece.length
     curve = build_curve(pieces)
     frame = curve.evaluate(curve.s + curve.length, np.arange(len(pieces)))
     gaps = np.hypot(*(np.stack([frame.x, frame.y]) - np.array(ends).T))
@@ -190,7 +242,60 @@ def _curve(shape: ET.Element, scale: _Scale, place: str, warnings: list[str]) ->
     return curve
 
 
-Read = Callable[[ET.Element, Point, Point, _Scale, str], list[tuple[Piece, Point]]]
+def _has_no_length(element: ET.Element, scale: _Scale, place: str) -> bool:
+    """Whether an element that ends at its start has no length, and is not a full circle or a loop."""
+    match element.tag:
+        case "Line":
+            return True
+        case "IrregularLine":
+            return not any((element.findtext(tag) or "").strip() for tag in ("PntList2D", "PntList3D"))
+        case _:
+            return element.get("length") is not None and 0.0 <= scale.length(element, "length", place) < NO_LENGTH_M
+
+
+def _choose_sides(shapes: list[_Shape], place: str, warnings: list[str]) -> None:
+    """Curves and spirals that length and PI do not decide are tangents of their neighbours, else turned as stated."""
+    order = range(len(shapes))
+    for i in (*order, *reversed(order)):
+        if not shapes[i].decided and (side := _tangent_side(shapes, i)) is not None:
+            shapes[i].side, shapes[i].decided = side, True
+    for i, shape in enumerate(shapes):
+        if not shape.decided and not shape.stated:
+            raise _wrong(f"{shape.place}: rot is missing, and nothing else shows the side of the turn", "cw or ccw")
+        if shape.side and shape.stated and _tangent_side(shapes, i) == 0:
+            raise _wrong(
+                f"{shape.place}: rot and the elements beside it contradict its PI and its length",
+                "a rot, a PI and a length of the same turn",
+            )
+    turned = [shape.place for shape in shapes if shape.side or not shape.stated]
+    if turned:
+        warnings.append(
+            f"{place}: rot is missing or contradicts the length, the PI or the elements beside it. The number of such "
+            f"curves and spirals is {len(turned)}, and the first is {turned[0].removeprefix(place + ', ')}. They turn "
+            "to the side that these show; compare the line with a map."
+        )
+
+
+def _tangent_side(shapes: list[_Shape], i: int) -> int | None:
+    """The side to which a curve or spiral turns as a tangent of its decided neighbours; None if they do not show it."""
+    misfits = []
+    for side in range(len(shapes[i].sides)):
+        angles = [0.0]
+        if i > 0 and shapes[i - 1].decided:
+            angles.append(shapes[i - 1].heading(shapes[i - 1].side, True) - shapes[i].heading(side, False))
+        if i + 1 < len(shapes) and shapes[i + 1].decided:
+            angles.append(shapes[i + 1].heading(shapes[i + 1].side, False) - shapes[i].heading(side, True))
+        misfits.append(sum(abs(math.remainder(angle, math.tau)) for angle in angles))
+    return _smaller(misfits) if min(misfits) < _TANGENT_RAD else None
+
+
+def _smaller(misfits: list[float]) -> int | None:
+    """Which of two misfits is clearly the smaller one; None if neither is, or if there is only one."""
+    low, high = min(misfits), max(misfits)
+    return misfits.index(low) if high > _NOTHING and low < _CLEARLY * high else None
+
+
+Read = Callable[[ET.Element, Point, Point, _Scale, str, list[str]], _Shape]
 
 
 def _line(start: Point, end: Point, place: str) -> tuple[Piece, Point]:
@@ -198,13 +303,15 @@ def _line(start: Point, end: Point, place: str) -> tuple[Piece, Point]:
     return Piece(place, 0.0, math.hypot(east, north), *start, math.atan2(north, east)), end
 
 
-def _read_line(_element: ET.Element, start: Point, end: Point, _scale: _Scale, place: str) -> list[tuple[Piece, Point]]:
-    return [_line(start, end, place)]
+def _read_line(
+    _element: ET.Element, start: Point, end: Point, _scale: _Scale, place: str, _warnings: list[str]
+) -> _Shape:
+    return _Shape(place, [[_line(start, end, place)]])
 
 
 def _read_irregular(
-    element: ET.Element, start: Point, end: Point, scale: _Scale, place: str
-) -> list[tuple[Piece, Point]]:
+    element: ET.Element, start: Point, end: Point, scale: _Scale, place: str, _warnings: list[str]
+) -> _Shape:
     points = [start]
     for tag, size in (("PntList2D", 2), ("PntList3D", 3)):
         numbers = (element.findtext(tag) or "").split()
@@ -213,57 +320,93 @@ def _read_irregular(
         points += [scale.local(*pair, place) for pair in zip(numbers[::size], numbers[1::size], strict=True)]
     points.append(end)
     pairs = [pair for pair in pairwise(points) if math.dist(*pair) > GAP_M]
-    return [_line(*pair, place) for pair in pairs] or [_line(start, end, place)]
+    return _Shape(place, [[_line(*pair, place) for pair in pairs] or [_line(start, end, place)]])
 
 
-def _read_curve(element: ET.Element, start: Point, end: Point, scale: _Scale, place: str) -> list[tuple[Piece, Point]]:
+def _read_curve(
+    element: ET.Element, start: Point, end: Point, scale: _Scale, place: str, warnings: list[str]
+) -> _Shape:
     """An arc through both ends: its radius is their mean distance from the centre, or stated."""
-    sign = _rotation(element, place)
     centre = scale.point(element, "Center", place)
     chord = math.dist(start, end)
+    first = last = 0.0
     if centre is not None:
         radii = math.dist(start, centre), math.dist(end, centre)
         radius = sum(radii) / 2.0
         if abs(radii[0] - radii[1]) > GAP_M:
-            report_gap(place, abs(radii[0] - radii[1]), "the distances of Start and End from Center differ by")
+            off_m = abs(radii[0] - radii[1])
+            warnings.append(report_gap(place, off_m, "the distances of Start and End from Center differ by"))
         first, last = (math.atan2(point[1] - centre[1], point[0] - centre[0]) for point in (start, end))
-        turn = sign * (last - first) % math.tau
     else:
         radius = scale.length(element, "radius", place)
-        turn = scale.length(element, "length", place) / radius if radius and element.get("length") else 0.0
     if not 0.0 < chord <= 2.0 * radius + GAP_M:
         raise _wrong(
             f"{place}: no arc of radius {radius / scale.unit_m:g} joins Start and End",
             "a radius of half the distance of Start and End at least, which differ",
         )
-    half = math.asin(min(chord / (2.0 * radius), 1.0))
-    half = math.pi - half if turn > math.pi else half
+    less = math.asin(min(chord / (2.0 * radius), 1.0))
     towards = math.atan2(end[1] - start[1], end[0] - start[0])
-    k = sign / radius
-    return [(Piece(place, 0.0, 2.0 * half * radius, *start, towards - sign * half, k, k), end)]
+    length = scale.length(element, "length", place) if element.get("length") else 0.0
+
+    def turned(sign: float) -> Piece:
+        turn = sign * (last - first) % math.tau if centre is not None else length / radius
+        half = math.pi - less if turn > math.pi else less
+        k = sign / radius
+        return Piece(place, 0.0, 2.0 * half * radius, *start, towards - sign * half, k, k)
+
+    return _both_sides(element, turned, end, scale, place)
 
 
-def _read_spiral(element: ET.Element, start: Point, end: Point, scale: _Scale, place: str) -> list[tuple[Piece, Point]]:
+def _read_spiral(
+    element: ET.Element, start: Point, end: Point, scale: _Scale, place: str, _warnings: list[str]
+) -> _Shape:
     """A clothoid, turned so that its chord has the direction from Start to End."""
     kind = element.get("spiType", "clothoid")
     if kind != "clothoid":
         raise _wrong(f"{place}: the spiral is {kind[:40]!r}", "clothoid", "export the alignment with clothoids")
-    sign = _rotation(element, place)
     length = scale.length(element, "length", place)
-    k0, k1 = (sign * _curvature(element, name, scale, place) for name in ("radiusStart", "radiusEnd"))
+    stated = [_curvature(element, name, scale, place) for name in ("radiusStart", "radiusEnd")]
     towards = math.atan2(end[1] - start[1], end[0] - start[0])
-    piece = Piece(place, 0.0, length, *start, towards, k0, k1)
-    if length > 0.0:
-        local = clothoid(*(np.array([value]) for value in (length, k0, k1, length)))
-        piece = piece._replace(hdg=towards - math.atan2(local[1][0], local[0][0]))
-    return [(piece, end)]
+
+    def turned(sign: float) -> Piece:
+        k0, k1 = (sign * value for value in stated)
+        hdg = towards
+        if length > 0.0:
+            local = clothoid(*(np.array([value]) for value in (length, k0, k1, length)))
+            hdg -= math.atan2(local[1][0], local[0][0])
+        return Piece(place, 0.0, length, *start, hdg, k0, k1)
+
+    return _both_sides(element, turned, end, scale, place)
 
 
-def _rotation(element: ET.Element, place: str) -> float:
-    rot = element.get("rot", "")
-    if rot not in ("cw", "ccw"):
-        raise _wrong(f"{place}: rot is {rot[:20]!r}", "cw or ccw")
-    return 1.0 if rot == "ccw" else -1.0
+def _both_sides(element: ET.Element, turned: Callable[[float], Piece], end: Point, scale: _Scale, place: str) -> _Shape:
+    """A curve or spiral turned to both sides, and the side that its length or PI show.
+
+    With Start and End, the PI fixes the turn. Arcs of more than 180 degrees have it behind their start, so that only
+    the lines through it count where the length shows which of two arcs about a centre it is.
+    """
+    rot = element.get("rot", "").strip().lower()
+    signs = (-1.0, 1.0) if rot == "cw" else (1.0, -1.0)
+    shape = _Shape(place, [[(turned(sign), end)] for sign in signs], stated=rot in ("cw", "ccw"))
+    if element.get("rot") and not shape.stated:
+        raise _wrong(f"{place}: rot is {element.get('rot', '')[:20]!r}", "cw or ccw")
+    length = scale.length(element, "length", place) if element.get("length") else 0.0
+    pi = scale.point(element, "PI", place)
+    by_length, by_pi = [], []
+    for side, ((piece, _stop),) in enumerate(shape.sides):
+        by_length.append(abs(piece.length / length - 1.0) if length > 0.0 else 0.0)
+        to_pi = [] if pi is None else [((piece.x, piece.y), pi, False), (pi, end, True)]
+        angles = [
+            math.atan2(two[1] - one[1], two[0] - one[0]) - shape.heading(side, at_end)
+            for one, two, at_end in to_pi
+            if math.dist(one, two) > NO_LENGTH_M
+        ]
+        by_pi.append(sum(abs(math.remainder(angle, math.pi if length > 0.0 else math.tau)) for angle in angles))
+    found = _smaller(by_length)
+    if found is None and min(by_pi) < _TANGENT_RAD:
+        found = _smaller(by_pi)
+    shape.side, shape.decided = found or 0, found is not None
+    return shape
 
 
 def _curvature(element: ET.Element, name: str, scale: _Scale, place: str) -> float:

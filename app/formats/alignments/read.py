@@ -15,6 +15,7 @@ from app.errors import InvalidParameter, ReferenceSystemError, UnreadableUpload,
 from app.formats.alignments.features import SPEEDS_KMH, RoadFeature, Shape, assemble_road, read_ring, read_vertices
 from app.formats.alignments.geometry import (
     MAX_VERTICES,
+    AlignmentDeclaration,
     AlignmentFile,
     BoundaryStyle,
     EarlierTransformation,
@@ -22,6 +23,7 @@ from app.formats.alignments.geometry import (
     StationEquation,
 )
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
+from app.formats.xml_tree import xml_head
 from app.roads.axis import Axis
 from app.roads.lane_line import CalibrationPoint, Measures, calibrate, cut_edges, parallel_line
 from app.values import Floats, JsonObject
@@ -273,7 +275,7 @@ def _equations(measures: Measures) -> Iterator[StationEquation]:
 # === Formats of roads: how each is detected and read. Libraries of rarer formats are loaded when they are needed.
 
 
-AlignmentReader = Callable[[bytes], AlignmentFile]
+AlignmentReader = Callable[[bytes, AlignmentDeclaration], AlignmentFile]
 
 _HEAD_BYTES = 4096  # [byte]
 _DXF_STARTS = (b"0\n", b"0\r", b"999\n", b"999\r")
@@ -303,51 +305,57 @@ def _detect_xml(root: str) -> Callable[[Sample], Confidence]:
     start = re.compile(rb"<(?:\w+:)?%s[\s/>]" % root.encode())
 
     def detect(sample: Sample) -> Confidence:
-        head = _head(sample)
+        head = xml_head(sample.data)
         return Confidence.CERTAIN if head.startswith(b"<") and start.search(head) else Confidence.NONE
 
     return detect
 
 
-def _read_opendrive(data: bytes) -> AlignmentFile:
+def _read_opendrive(data: bytes, _declaration: AlignmentDeclaration) -> AlignmentFile:
     from app.formats.alignments.opendrive import read_opendrive
 
     return read_opendrive(data)
 
 
-def _read_landxml(data: bytes) -> AlignmentFile:
+def _read_landxml(data: bytes, declaration: AlignmentDeclaration) -> AlignmentFile:
     from app.formats.alignments.landxml import read_landxml
 
-    return read_landxml(data)
+    return read_landxml(data, declaration)
 
 
-def _read_lanelet2(data: bytes) -> AlignmentFile:
+def _read_lanelet2(data: bytes, _declaration: AlignmentDeclaration) -> AlignmentFile:
     from app.formats.alignments.lanelet2 import read_lanelet2
 
     return read_lanelet2(data)
 
 
-def _read_gpkg(data: bytes) -> AlignmentFile:
+def _read_gpkg(data: bytes, _declaration: AlignmentDeclaration) -> AlignmentFile:
     from app.formats.alignments.vector import read_gpkg
 
     return read_gpkg(data)
 
 
-def _read_shapefile(data: bytes) -> AlignmentFile:
+def _read_shapefile(data: bytes, _declaration: AlignmentDeclaration) -> AlignmentFile:
     from app.formats.alignments.vector import read_shapefile
 
     return read_shapefile(data)
 
 
-def _read_dxf(data: bytes) -> AlignmentFile:
+def _read_dxf(data: bytes, declaration: AlignmentDeclaration) -> AlignmentFile:
     from app.formats.alignments.dxf import read_dxf
 
-    return read_dxf(data)
+    return read_dxf(data, declaration)
 
 
 ALIGNMENT_FORMATS: tuple[Format[AlignmentReader], ...] = (
-    Format("road", Use.ALIGNMENT, "registered road", _detect_registered_road, read_registered_road),
-    Format("geojson", Use.ALIGNMENT, "GeoJSON", _detect_geojson, read_geojson),
+    Format(
+        "road",
+        Use.ALIGNMENT,
+        "registered road",
+        _detect_registered_road,
+        lambda data, _declaration: read_registered_road(data),
+    ),
+    Format("geojson", Use.ALIGNMENT, "GeoJSON", _detect_geojson, lambda data, _declaration: read_geojson(data)),
     Format("gpkg", Use.ALIGNMENT, "GeoPackage", detect_signature(b"SQLite format 3\x00"), _read_gpkg),
     Format("shapefile", Use.ALIGNMENT, "zipped Shapefile", detect_signature(b"PK\x03\x04"), _read_shapefile),
     Format("opendrive", Use.ALIGNMENT, "OpenDRIVE", _detect_xml("OpenDRIVE"), _read_opendrive),
@@ -360,7 +368,9 @@ ALIGNMENT_FORMATS: tuple[Format[AlignmentReader], ...] = (
 # === Files with roads.
 
 
-def read_alignment(data: bytes, name: str = "", *, format: str | None = None) -> AlignmentFile:
+def read_alignment(
+    data: bytes, name: str = "", *, format: str | None = None, declaration: AlignmentDeclaration | None = None
+) -> AlignmentFile:
     """Read a road of any format.
 
     Parameters
@@ -369,6 +379,8 @@ def read_alignment(data: bytes, name: str = "", *, format: str | None = None) ->
         Of the file, for messages.
     format : str, optional
         Name of a format in `ALIGNMENT_FORMATS`; detected by the content if it is left out.
+    declaration : AlignmentDeclaration, optional
+        Units and CRS that the file does not state.
 
     Raises
     ------
@@ -393,4 +405,4 @@ def read_alignment(data: bytes, name: str = "", *, format: str | None = None) ->
             limit=list_accepted(ALIGNMENT_FORMATS),
             cure="export it again in one of these formats",
         )
-    return found.read(data)
+    return found.read(data, declaration or AlignmentDeclaration())

@@ -24,12 +24,36 @@ METRES: dict[str, float] = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.304
 """Metres to a unit of length: US survey foot and international foot (NIST SP 811)."""
 FEET = "ft"
 """Unit of a file that does not state which foot."""
+_FOOT_NAMES = ("ft-us", "ft-intl")
 TEXT_ROLES = ("point", "code", "description", "road", "side", "status")
 NUMBER_ROLES = ("heading_deg", "measure_m", "offset_m", "horizontal_rmse_m", "vertical_rmse_m")
 COORDINATE_ROLES = ("lon_deg", "lat_deg", "easting", "northing", "height")
 ROLES = (*COORDINATE_ROLES, *TEXT_ROLES, *NUMBER_ROLES)
 MAX_AREA_DEG = 30.0
 """Largest side of a declared area: a larger one would check nothing. [deg]"""
+
+
+def choose_foot(declared: str | None, crs_unit_m: float) -> tuple[str, bool]:
+    """The foot of a file that does not state which: the declared one, else that of the CRS, else the international one.
+
+    Parameters
+    ----------
+    declared : str or None
+        The declared unit.
+    crs_unit_m : float
+        Length of the unit of the CRS. [m]
+
+    Returns
+    -------
+    foot : str
+        ``ft-us`` or ``ft-intl``.
+    of_crs : bool
+        Whether it is that of the CRS.
+    """
+    if declared in _FOOT_NAMES:
+        return declared, False
+    own = next((foot for foot in _FOOT_NAMES if abs(crs_unit_m / METRES[foot] - 1) < 1e-9), None)
+    return own or "ft-intl", own is not None
 
 
 _Name = Annotated[Text, Field(min_length=1, max_length=200)]

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from app.errors import UnreadableUpload, WaymarkError
 from app.formats.surveys.declaration import FEET
-from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, Faults, SourceTable
+from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, Faults, SourceTable, warn
 
 _UNITS = {
     1: (FEET, 1 / 12),
@@ -26,11 +28,19 @@ _UNITS = {
 """Unit of length of each code of $INSUNITS, and how many of it one unit of the drawing is: inches, feet, mm, cm, m, km,
 dm, US survey feet. Source: Autodesk DXF reference, "HEADER section group codes"."""
 _UNITLESS = 0
+_MAX_IN_BLOCKS = 200_000  # entities of block references, with those that are nested; bounds the time of a file
+_MAX_NESTED = 20  # levels of block references
+_HEADER_BYTES = 1 << 16  # [byte] in which $DWGCODEPAGE stands
+_CODE_PAGE = re.compile(rb"\$DWGCODEPAGE\s+3\s+(\w+)", re.ASCII)
+_SHOWN = 10  # names of layers in a message
 _HEAD_BYTES = 4096  # [byte] in which a binary file shows itself
 
 
 def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceTable:
     """Points and block references of the model space; their layer, block and attributes are columns.
+
+    A block without attributes that holds several points is a part of the drawing, whose points are read instead.
+    What CAD does not draw, on frozen or switched-off layers, is left out.
 
     Parameters
     ----------
@@ -44,23 +54,38 @@ def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceT
     UnreadableUpload
         It is no ASCII DXF, has units that no survey has, or too many entities.
     """
+    hidden: set[str] = set()
     with reading_dxf():
         document, found = open_dxf(data)
-        entities = list(document.modelspace().query("POINT INSERT"))
+        entities = [
+            (entity, on)
+            for entity, on in drawn_entities(document, frozenset({"POINT", "INSERT"}), _is_part, hidden)
+            if entity.dxftype() == "POINT" or not _is_part(entity, on)
+        ]
     rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
-    for entity in entities:
-        if layer is not None and entity.dxf.layer != layer:
+    for entity, on in entities:
+        if layer is not None and on != layer:
             continue
         place = entity.dxf.get("location" if entity.dxftype() == "POINT" else "insert")
         if place is None:
             faults.append(Fault(len(rows) + 1, "geometry", "no_point", "the entity has no place"))
             place = (np.nan, np.nan, np.nan)
-        rows.append(_values(entity))
+        rows.append(_values(entity, on))
         points.append((float(place[0]), float(place[1]), float(place[2])))
         if len(rows) > MAX_ROWS:
             raise _damaged("it has too many entities")
+    if hidden:
+        message, cure = hidden_layers(hidden), "thaw or switch on layers whose points are wanted, and export again"
+        if not rows:
+            raise UnreadableUpload(
+                f"the DXF has no points that are drawn. {message}",
+                field="file",
+                limit="points that are drawn",
+                cure=cure,
+            )
+        faults.append(warn(None, "geometry", "hidden_layers", message, cure))
     names = tuple(dict.fromkeys(name for row in rows for name in row))[:MAX_COLUMNS]
     xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
     detected: tuple[Detected, ...] = ()
@@ -106,13 +131,15 @@ def open_dxf(data: bytes) -> tuple[Any, tuple[str, float] | None]:
         It is no ASCII DXF, or has units that no survey has.
     """
     from ezdxf.filemanagement import read
+    from ezdxf.tools.codepage import toencoding
 
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:
         if b"\x00" in data[:_HEAD_BYTES]:
             raise _damaged("it is no ASCII DXF") from None
-        text = data.decode("cp1252", "replace")  # before R2007 in the code page of the system; numbers are ASCII
+        page = _CODE_PAGE.search(data[:_HEADER_BYTES])  # before R2007 texts are in the code page of the system
+        text = data.decode(toencoding(page[1].decode()) if page else "cp1252", "replace")
     document = read(io.StringIO(text, newline=None))
     code = document.header.get("$INSUNITS", _UNITLESS)
     if code == _UNITLESS:
@@ -122,8 +149,74 @@ def open_dxf(data: bytes) -> tuple[Any, tuple[str, float] | None]:
     return document, _UNITS[code]
 
 
-def _values(entity: Any) -> dict[str, object]:
-    values: dict[str, object] = {"layer": entity.dxf.layer}
+def drawn_entities(
+    document: Any, kinds: frozenset[str], is_opened: Callable[[Any, str], bool], hidden: set[str]
+) -> Iterator[tuple[Any, str]]:
+    """Entities of the model space that CAD draws, each with its layer; those in blocks where their references put them.
+
+    Parameters
+    ----------
+    kinds : frozenset of str
+        Their types; ``INSERT`` gives the block references themselves.
+    is_opened : function
+        Of a block reference and its layer: whether the entities in its block are wanted, too.
+    hidden : set of str
+        The names of layers with such entities that are frozen or switched off are added.
+    """
+    layers = [(str(layer.dxf.name).lower(), layer) for layer in document.layers]
+    frozen = {name for name, layer in layers if layer.is_frozen()}
+    off = {name for name, layer in layers if layer.is_off()}
+    in_blocks = 0
+
+    def walk(entities: Iterable[Any], layer_of_block: str | None, level: int) -> Iterator[tuple[Any, str]]:
+        nonlocal in_blocks
+        for entity in entities:
+            in_blocks += level > 0
+            if in_blocks > _MAX_IN_BLOCKS or level > _MAX_NESTED:
+                raise _damaged(f"its blocks hold over {_MAX_IN_BLOCKS} entities, or {_MAX_NESTED} levels of blocks")
+            kind, layer = entity.dxftype(), str(entity.dxf.layer)
+            if kind not in kinds and kind != "INSERT":
+                continue
+            if layer == "0" and layer_of_block is not None:
+                layer = layer_of_block  # entities on layer 0 of a block are on the layer of its reference
+            if layer.lower() in frozen or (layer.lower() in off and kind != "INSERT"):
+                hidden.add(layer)
+                continue
+            if entity.dxf.get("invisible", 0):
+                continue
+            if kind in kinds and layer.lower() not in off:
+                yield entity, layer
+            if kind == "INSERT" and entity.block() is not None and is_opened(entity, layer):
+                for reference in entity.multi_insert() if entity.mcount > 1 else (entity,):
+                    yield from walk(reference.virtual_entities(), layer, level + 1)
+
+    return walk(document.modelspace(), None, 0)
+
+
+def hidden_layers(hidden: set[str]) -> str:
+    """The warning about layers that are not drawn."""
+    names = sorted(hidden)
+    shown = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    one = len(names) == 1
+    return (
+        f"{'The layer' if one else 'The layers'} {shown[:400]} {'is' if one else 'are'} frozen or switched off in the "
+        "drawing; what is on "
+        f"{'it' if one else 'them'} is left out."
+    )
+
+
+def _is_part(insert: Any, _layer: str) -> bool:
+    """Whether a block reference is a part of the drawing, such as a bound external reference, not a surveyed point."""
+    block = insert.block()
+    if block is None or insert.attribs:
+        return False
+    return (
+        next(islice((entity for entity in block if entity.dxftype() in ("POINT", "INSERT")), 1, None), None) is not None
+    )
+
+
+def _values(entity: Any, layer: str) -> dict[str, object]:
+    values: dict[str, object] = {"layer": layer}
     if entity.dxftype() == "INSERT":
         values["block"] = entity.dxf.name
         values |= {str(attribute.dxf.tag).lower(): attribute.dxf.text for attribute in entity.attribs}

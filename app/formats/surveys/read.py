@@ -25,7 +25,7 @@ from app.formats.format import (
 )
 from app.formats.surveys.coordinates import check_second_pair, crs_unit, read_coordinates, unit_factor, without_zone
 from app.formats.surveys.csv_reader import read_csv, read_gsi
-from app.formats.surveys.declaration import FEET, METRES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
+from app.formats.surveys.declaration import FEET, METRES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration, choose_foot
 from app.formats.surveys.roles import CodeForm, cell_text, find_roles
 from app.formats.surveys.table import (
     MAX_COLUMNS,
@@ -271,7 +271,6 @@ _DOCUMENTS = (
     (b"LASF", "a point cloud", "export the points of the markers alone"),
 )
 """First bytes of files that are sent by mistake, their kind, and how a survey is made of it."""
-_FEET = ("ft-us", "ft-intl")
 _UNIT_ENDINGS = (("_usft", "ft-us"), ("_ftus", "ft-us"), ("_ft", "ft-intl or ft-us"), ("(ft)", "ft-intl or ft-us"))
 
 
@@ -425,8 +424,8 @@ def _units(
     own = crs_unit(system)
     of_file, faults = source.unit, list[Fault]()
     if of_file == FEET:
-        of_file = declaration.unit if declaration.unit in _FEET else own if own in _FEET else "ft-intl"
-        if own in _FEET and declaration.unit is None:
+        of_file, of_crs = choose_foot(declaration.unit, METRES.get(own, 1.0))
+        if of_crs and declaration.unit is None:
             message = f"the file is in feet without stating which; they were read as {own}, the unit of {system.name}"
             cure = "declare unit: ft-us or ft-intl; they differ by 2 ppm, a metre in 500 km"
             faults.append(warn(None, "unit", "which_foot", message, cure, (Change("unit", own),)))

@@ -162,7 +162,7 @@ def check_size(rows: int, names: int) -> None:
 
 def elements(data: bytes, *names: str) -> Iterator[ET.Element]:
     """Elements of these names; each is forgotten after its turn."""
-    check_xml(data, max_elements=MAX_ELEMENTS, cure="send the points alone")
+    data = check_xml(data, max_elements=MAX_ELEMENTS, cure="send the points alone")
     parents: list[ET.Element] = []
     for event, element in ET.iterparse(io.BytesIO(data), events=("start", "end")):
         if event == "start":

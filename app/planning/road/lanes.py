@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -93,17 +93,29 @@ def check_length(lines: Sequence[Sequence[GroundLine]]) -> None:
         )
 
 
-def check_line(name: str, lon_deg: Floats, vertices: Floats, index: Floats, crs: str) -> None:
-    """Raises InvalidParameter if a vertex could not be placed on Earth."""
+def check_line(
+    name: str, lon_deg: Floats, vertices: Floats, index: Floats, crs: str, is_inside_exchanged: Callable[[], bool]
+) -> None:
+    """Raises InvalidParameter if a vertex could not be placed on Earth.
+
+    Parameters
+    ----------
+    is_inside_exchanged : function
+        Whether the vertices can be placed with their two coordinates exchanged, for the message.
+    """
     bad = np.flatnonzero(~np.isfinite(lon_deg))
     if len(bad):
         x, y = vertices[bad[0], :2]
+        state, cure = "", "check the CRS and the order of the coordinates (longitude or easting first)"
+        if is_inside_exchanged():
+            state = ", but inside it if the two coordinates are exchanged"
+            cure = "exchange the two coordinates of all points, which the file has in the other order, or check the CRS"
         raise InvalidParameter(
             f"lane {name}: vertex {int(index[bad[0]]) + 1} at {x:.9g}, {y:.9g} is outside the area of use of "
-            f"{crs[:60]}",
+            f"{crs[:60]}{state}",
             field="crs",
             limit="coordinates in the area of use of the CRS",
-            cure="check the CRS and the order of the coordinates (longitude or easting first)",
+            cure=cure,
         )
 
 

@@ -12,11 +12,10 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, ReferenceSystemError
-from app.formats.alignments.geometry import AlignmentFile
+from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile
 from app.formats.surveys.declaration import METRES
 from app.geodesy import normalize_crs, place_positions, reference_system
 from app.geodesy.systems import is_global
-from app.planning.alignment import AlignmentDeclaration
 from app.values import Floats
 
 MAX_LOCAL_M = 200_000.0

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields
 from datetime import timedelta
 
+import sqlalchemy as sa
 from pydantic import TypeAdapter
 
 from app.errors import InvalidParameter
+from app.formats.alignments.geometry import AlignmentDeclaration
 from app.formats.alignments.read import RegisteredRoad, RoadLanes, write_registered_road
 from app.formats.format import SpooledFile
 from app.geodesy import LocalizationGrade
-from app.planning.alignment import AlignmentDeclaration
 from app.registry.database import Database
-from app.registry.markers import MarkerFilter
+from app.registry.markers import MarkerFilter, is_any_near
 from app.registry.plan_features import add_lanes
 from app.registry.plans import ALIGNMENTS, AlignmentRow, list_for_map
 from app.registry.resources import first_version
@@ -25,14 +27,17 @@ from app.services.access.audit import log_change
 from app.services.blobs import staged
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
-from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
+from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile, RoadSummary
 from app.services.plans.tasks import MapForm, RoadFile, profile_road, summarize_road, write_map
 from app.services.ports import Blobs, Clock, DecoderProcesses
+from app.surveys.location_checks import KNOWN_M
 
 BUSY_WAIT_S = 10.0
 """How long a request waits for a decoder process. [s] As imports."""
 MAX_MAP_MARKERS = 50_000
 """Markers around a road that a map is chosen from. Bounds the memory."""
+_LON_LAT = ("OGC:CRS84", "EPSG:4326")
+"""Reference systems without an area of use that would show exchanged coordinates."""
 _DECLARED = tuple(field.name for field in fields(AlignmentDeclaration))
 _DECLARATION = TypeAdapter(AlignmentDeclaration)
 
@@ -108,6 +113,8 @@ class Alignments:
         with self._database.read() as connection:
             ALIGNMENTS.check_name(connection, agency_id, name)
         read = self._processes.run(summarize_road, road, wait_s=BUSY_WAIT_S)
+        with self._database.read() as connection:
+            exchanged = list(_find_exchanged(connection, agency_id, read.summary))
         with staged(self._blobs) as stage:
             source_key = stage.add("alignments", road.file)
             with (
@@ -127,7 +134,7 @@ class Alignments:
                         "file_name": road.file_name,
                         **source,
                     },
-                    "summary": read.summary,
+                    "summary": {**read.summary, "warnings": [*exchanged, *read.summary["warnings"]]},
                 }
                 document = answer.store(alignment_document(ALIGNMENTS.add(connection, agency_id, values)))
                 add_lanes(connection, agency_id, document["id"], read.lanes)
@@ -210,6 +217,21 @@ def alignment_document(row: AlignmentRow) -> AlignmentDocument:
     return document_of(
         AlignmentDocument, row, **{name: value for name, value in row.summary.items() if name not in own}
     )
+
+
+def _find_exchanged(connection: sa.Connection, agency_id: str, summary: RoadSummary) -> Iterator[str]:
+    """A warning if registered markers show that longitude and latitude are exchanged, as for surveys."""
+    west, south, east, north = summary["extent_deg"]
+    lon_deg, lat_deg = (west + east) / 2, (south + north) / 2
+    if summary["crs"] not in _LON_LAT or west > east or abs(lon_deg) > 90.0:
+        return
+    if is_any_near(connection, agency_id, lon_deg, lat_deg, KNOWN_M):
+        return
+    if is_any_near(connection, agency_id, lat_deg, lon_deg, KNOWN_M):
+        yield (
+            f"No marker is registered within {KNOWN_M / 1000:g} km of the road, but some are near it if longitude and "
+            "latitude are exchanged. Check the order of the coordinates: GeoJSON has the longitude first."
+        )
 
 
 def _registered_road(row: RoadRow, lanes: RoadLanes) -> RegisteredRoad:

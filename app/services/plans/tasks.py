@@ -14,14 +14,14 @@ import numpy.typing as npt
 import orjson
 
 from app.families import get_family, rows_of_plan
-from app.formats.alignments.geometry import AlignmentFile
+from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile
 from app.formats.alignments.read import read_alignment
 from app.formats.format import SpooledFile
 from app.geodesy.systems import is_ellipsoidal
 from app.markers.magnet_design import Codebook
 from app.markers.plate import PlateGeometry
 from app.markers.reading import MarkerRow, PlateReading, worst_verdict
-from app.planning.alignment import Alignment, AlignmentDeclaration, Lane, RoadEvent
+from app.planning.alignment import Alignment, Lane, RoadEvent
 from app.planning.outputs.bill import plan_bill
 from app.planning.outputs.hd_lanelet2 import write_lanelet2
 from app.planning.outputs.hd_map import map_of_road
@@ -316,7 +316,7 @@ class SummarizedRoad:
 @decoder_task(*_ROAD)
 def summarize_road(road: RoadFile) -> SummarizedRoad:
     """Read a road: its lanes, events, warnings and extent."""
-    file = read_alignment(road.file.read(), road.file_name)
+    file = _read(road)
     alignment = _build(file, road, None)
     return SummarizedRoad(road_summary(alignment, file.format), lane_features(alignment))
 
@@ -324,16 +324,20 @@ def summarize_road(road: RoadFile) -> SummarizedRoad:
 @decoder_task(*_ROAD)
 def profile_road(road: RoadFile, samples: int) -> AlignmentProfile:
     """Read a road to draw it: its lanes with at most so many samples each."""
-    return alignment_profile(_build(read_alignment(road.file.read(), road.file_name), road, None), samples)
+    return alignment_profile(_build(_read(road), road, None), samples)
 
 
 @decoder_task(*_ROAD)
 def write_map(road: RoadFile, form: MapForm, markers: tuple[MarkerRow, ...], within_m: float) -> bytes:
     """Write a road as an HD map, with those of the markers that are near the centre line of a lane."""
-    alignment = _build(read_alignment(road.file.read(), road.file_name), road, None)
+    alignment = _build(_read(road), road, None)
     points = [point for row in markers for point in get_family(row.family).map_markers(row)]
     content = map_of_road(alignment, points, within_m=within_m)
     return write_lanelet2(content) if form == "osm" else write_opendrive(content, leave_out=True)
+
+
+def _read(road: RoadFile) -> AlignmentFile:
+    return read_alignment(road.file.read(), road.file_name, declaration=road.declaration)
 
 
 def _build(file: AlignmentFile, road: RoadFile, rules: RoadRules | None) -> Alignment:
@@ -381,7 +385,7 @@ def make_plan(
     from app.planning import planner
 
     checked = check_rules(rules)
-    alignment = _build(read_alignment(road.file.read(), road.file_name), road, checked.road)
+    alignment = _build(_read(road), road, checked.road)
     numbers = unused_numbers(taken, zlib.crc32(name.encode()))
     book = Codebook.from_document(codebook) if codebook is not None else None
     plan = planner.make_plan(alignment, checked, name=name, codebook=book, numbers=numbers, existing=existing)

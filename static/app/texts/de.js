@@ -883,6 +883,7 @@ export default {
   "import_fault.height_shift": "Höhen sind verschoben",
   "import_fault.height_step": "Sprung in den Höhen",
   "import_fault.hemisphere_letter": "Buchstabe statt Vorzeichen",
+  "import_fault.hidden_layers": "Layer, die nicht gezeichnet sind",
   "import_fault.isolated": "Weit von allen anderen",
   "import_fault.keyed_in_point": "Eingetippter Punkt",
   "import_fault.local_scale": "Maßstab des örtlichen Netzes",

@@ -883,6 +883,7 @@ export default {
   "import_fault.height_shift": "Heights are shifted",
   "import_fault.height_step": "Step in the heights",
   "import_fault.hemisphere_letter": "Letter instead of a sign",
+  "import_fault.hidden_layers": "Layers that are not drawn",
   "import_fault.isolated": "Far from all others",
   "import_fault.keyed_in_point": "Keyed-in point",
   "import_fault.local_scale": "Scale of the local grid",

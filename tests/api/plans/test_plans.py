@@ -122,6 +122,35 @@ def test_bad_roads_are_refused_and_nothing_is_stored(client: httpx.Client) -> No
     assert client.get("/v1/alignments").json()["items"] == []
 
 
+def test_exchanged_coordinates_are_noticed_beside_registered_markers(client: httpx.Client) -> None:
+    created(client, "/v1/markers", position={"lon_deg": 11.0, "lat_deg": 46.0}, heading_deg=90)
+    right = json.loads(road(11.0, 46.0))
+    wrong = json.loads(json.dumps(right))
+    for feature in wrong["features"]:
+        points = feature["geometry"]["coordinates"]
+        feature["geometry"]["coordinates"] = [p[::-1] for p in points] if isinstance(points[0], list) else points[::-1]
+    warnings = send_road(client, json.dumps(wrong).encode()).json()["warnings"]
+    assert "some are near it if longitude and latitude are exchanged" in warnings[0]
+    assert send_road(client, json.dumps(right).encode()).json()["warnings"] == []
+
+
+def test_feet_of_a_road_are_those_of_its_crs_unless_declared(client: httpx.Client) -> None:
+    """`foot` in a state plane file; the line begins 0.6 m farther north-east in US survey feet."""
+    text = (
+        '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2"><Units><Imperial linearUnit="foot"/></Units>'
+        '<CoordinateSystem epsgCode="6539"/><Alignments><Alignment name="A"><CoordGeom><Line><Start>200000 986000'
+        "</Start><End>200000 986300</End></Line></CoordGeom></Alignment></Alignments></LandXML>"
+    )
+    west = {}
+    for unit in (None, "ft-us", "ft-intl"):
+        declared = {} if unit is None else {"unit": unit}
+        document = send_road(client, text.encode(), **declared).json()
+        west[unit] = document["extent_deg"][0]
+        assert any("read as ft-us" in warning for warning in document["warnings"]) == (unit is None)
+    assert west[None] == west["ft-us"] == pytest.approx(-73.9936932, abs=1e-7)
+    assert west["ft-intl"] == pytest.approx(-73.9937003, abs=1e-7)
+
+
 @pytest.mark.slow
 def test_a_plan_is_made_checked_approved_and_committed(
     client: httpx.Client, alignment: dict[str, Any], other_planner: httpx.Client

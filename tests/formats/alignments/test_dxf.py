@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from app.errors import UnreadableUpload, WaymarkError
-from app.formats.alignments.geometry import AlignmentFile, EventKind, LaneGeometry
+from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile, EventKind, LaneGeometry
 from app.formats.alignments.read import read_alignment
 
 BULGE_90 = math.tan(math.pi / 8)
@@ -23,10 +23,19 @@ def _drawing(unit: int = 6) -> tuple[Any, Any]:
     return document, document.modelspace()
 
 
-def _read(document: Any) -> AlignmentFile:
+def _read(document: Any, **declared: Any) -> AlignmentFile:
     stream = io.StringIO()
     document.write(stream)
-    return read_alignment(stream.getvalue().encode())
+    return read_alignment(stream.getvalue().encode(), declaration=AlignmentDeclaration(**declared))
+
+
+def _centres(file: AlignmentFile) -> dict[str, list[list[float]]]:
+    """Ends of the centre lines of all lanes, in the plane."""
+    found = {}
+    for lane in file.lanes:
+        assert lane.centre is not None
+        found[lane.name] = np.round(lane.centre[[0, -1], :2], 6).tolist()
+    return found
 
 
 def _on_circle(lane: LaneGeometry, centre: tuple[float, float], radius: float) -> float:
@@ -155,12 +164,236 @@ def test_units_and_what_is_left_out() -> None:
     curvature = file.lanes[0].curvature_per_m
     assert curvature is not None
     assert curvature.max() == pytest.approx(1 / 30.48)
-    assert "splines" in file.warnings[0]
+    assert "1 splines are left out, the first on layer S" in file.warnings[1]
     document, space = _drawing(0)
     space.add_line((0, 0), (90, 0))
     unstated = _read(document)
     assert unstated.unit_m is None
     assert "no unit" in unstated.warnings[0]
+
+
+# --- what is drawn ----------------------------------------------------------------------------------------------------
+
+
+def test_layers_that_are_not_drawn_are_left_out() -> None:
+    document, space = _drawing()
+    document.layers.add("Old").freeze()
+    document.layers.add("OFF").off()
+    document.layers.add("viewport").dxf.flags = 2  # frozen in new viewports only
+    document.layers.add("locked").lock()
+    for k, layer in enumerate(("LANE", "OLD", "off", "viewport", "locked")):
+        space.add_lwpolyline([(0, 9 * k), (90, 9 * k)], dxfattribs={"layer": layer})
+    space.add_line((0, 99), (90, 99), dxfattribs={"layer": "LANE", "invisible": 1})
+    space.add_text("70", dxfattribs={"layer": "OFF", "insert": (10, 1)})
+    file = _read(document)
+    assert [lane.name for lane in file.lanes] == ["LANE", "viewport", "locked"]
+    (warning,) = file.warnings
+    assert warning.startswith("The layers OFF, OLD, off are frozen or switched off")
+
+
+def test_a_drawing_whose_lines_are_all_hidden_is_refused_with_the_cure() -> None:
+    document, space = _drawing()
+    document.layers.add("OLD").freeze()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "OLD"})
+    with pytest.raises(UnreadableUpload, match="layer OLD is frozen or switched off") as caught:
+        _read(document)
+    assert "thaw" in (caught.value.cure or "")
+
+
+def test_blocks_are_read_where_they_are_inserted() -> None:
+    document, space = _drawing()
+    inner = document.blocks.new("INNER")
+    inner.add_line((0, 0), (50, 0), dxfattribs={"layer": "nested"})
+    outer = document.blocks.new("OUTER", base_point=(10, 0))
+    outer.add_lwpolyline([(10, 0), (110, 0)], dxfattribs={"layer": "own"})
+    outer.add_line((10, 4), (110, 4))  # on layer 0: on the layer of the reference
+    outer.add_blockref("INNER", (10, 8), dxfattribs={"rotation": 90})
+    space.add_blockref(
+        "OUTER", (1000, 500), dxfattribs={"layer": "host", "rotation": 90, "xscale": 2, "yscale": 2, "zscale": 2}
+    )
+    found = _centres(_read(document))
+    assert found["own"] == [[1000, 500], [1000, 700]]
+    assert found["host"] == [[992, 500], [992, 700]]
+    assert found["nested"] == [[984, 500], [884, 500]]
+
+
+@pytest.mark.parametrize(("xscale", "yscale"), [(1, -1), (-1, 1), (-2, 2)])
+def test_arcs_of_mirrored_blocks_turn_to_the_other_side(xscale: int, yscale: int) -> None:
+    document, space = _drawing()
+    block = document.blocks.new("B")
+    block.add_lwpolyline([(0, 0, 0), (100, 0, BULGE_90), (120, 20, 0)], format="xyb", dxfattribs={"layer": "A"})
+    block.add_line((0, 50), (100, 50), dxfattribs={"layer": "L"})
+    block.add_arc((100, 70), 20, 270, 360, dxfattribs={"layer": "L"})
+    space.add_blockref("B", (1000, 0), dxfattribs={"xscale": xscale, "yscale": yscale, "zscale": abs(xscale)})
+    size = abs(xscale)
+    for lane, y in zip(_read(document).lanes, (20, 70), strict=True):
+        assert _on_circle(lane, (1000 + 100 * xscale, y * yscale), 20 * size) < 1e-6
+        assert lane.curvature_per_m is not None
+        turns = lane.curvature_per_m[lane.curvature_per_m != 0]
+        np.testing.assert_allclose(turns, -1 / (20 * size), rtol=1e-9)
+
+
+def test_rows_of_a_block_are_lanes_beside_each_other() -> None:
+    document, space = _drawing()
+    document.blocks.new("LANE").add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    space.add_blockref("LANE", (0, 0), dxfattribs={"row_count": 3, "row_spacing": 3.5})
+    assert [ends[0][1] for ends in _centres(_read(document)).values()] == [0.0, 3.5, 7.0]
+
+
+def test_layers_of_bound_references_have_their_own_names() -> None:
+    document, space = _drawing()
+    block = document.blocks.new("plan")
+    block.add_line((0, 3.5), (90, 3.5), dxfattribs={"layer": "plan$0$Lane3_left"})
+    block.add_line((0, 0), (90, 0), dxfattribs={"layer": "plan$0$Lane3_right"})
+    block.add_line((40, -2), (40, 2), dxfattribs={"layer": "base$1$plan$0$stop-line"})
+    block.add_circle((20, 0), 0.4, dxfattribs={"layer": "plan$0$Manholes"})
+    space.add_blockref("plan", (500, 0))
+    file = _read(document)
+    (lane,) = file.lanes
+    assert lane.name == "Lane3"
+    assert lane.left is not None
+    assert lane.left[0, :2].tolist() == [500, 3.5]
+    assert [(event.kind, event.point) for event in file.events] == [(EventKind.STOP_LINE, (540.0, 0.0))]
+    assert [area.kind for area in file.areas] == ["manholes"]
+
+
+def test_symbols_are_no_lanes_but_events_and_areas() -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "road"})
+    arrow = document.blocks.new("ARROW")
+    arrow.add_line((0, 0), (0, 2))
+    arrow.add_attdef("VALUE", (0, 0))
+    cover = document.blocks.new("COVER")
+    cover.add_circle((0, 0), 0.4)
+    space.add_blockref("ARROW", (10, 30), dxfattribs={"layer": "symbols"})
+    space.add_blockref("ARROW", (30, 0), dxfattribs={"layer": "arrow"}).add_attrib("VALUE", "left", (30, 0))
+    space.add_blockref("COVER", (50, 0), dxfattribs={"layer": "manholes"})
+    space.add_blockref("NOWHERE", (50, 50))
+    file = _read(document)
+    assert [lane.name for lane in file.lanes] == ["road"]
+    assert [(event.kind, event.point, event.value) for event in file.events] == [(EventKind.ARROW, (30.0, 0.0), "left")]
+    assert [area.ring.mean(axis=0).round(1).tolist() for area in file.areas] == [[50.0, 0.0]]
+    assert [warning for warning in file.warnings if "symbols" in warning] == list(file.warnings)
+
+
+def test_blocks_on_hidden_layers_are_left_out() -> None:
+    document, space = _drawing()
+    document.layers.add("frozen").freeze()
+    document.layers.add("off").off()
+    block = document.blocks.new("B")
+    block.add_line((0, 0), (90, 0))
+    block.add_line((0, 4), (90, 4), dxfattribs={"layer": "own"})
+    space.add_blockref("B", (0, 0), dxfattribs={"layer": "frozen"})
+    space.add_blockref("B", (0, 100), dxfattribs={"layer": "off"})  # as CAD: only entities on layer 0 are switched off
+    file = _read(document)
+    assert _centres(file) == {"own": [[0, 104], [90, 104]]}
+    assert "The layers frozen, off are frozen or switched off" in file.warnings[0]
+
+
+def test_blocks_that_cannot_be_read_are_reported() -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    document.add_xref_def("other.dwg", "other")
+    space.add_blockref("other", (0, 0))
+    block = document.blocks.new("B")
+    block.add_lwpolyline([(0, 30, 0), (100, 30, BULGE_90), (120, 50, 0)], format="xyb", dxfattribs={"layer": "A"})
+    space.add_blockref("B", (0, 0), dxfattribs={"xscale": 2})  # arcs become ellipses
+    warnings = " ".join(_read(document).warnings)
+    assert "1 references to other drawings are left out, the first is other; bind" in warnings
+    assert "1 ellipses are left out, the first on layer A" in warnings
+    loop = document.blocks.new("LOOP")
+    loop.add_line((0, 0), (90, 0))
+    loop.add_blockref("LOOP", (9, 9))
+    space.add_blockref("LOOP", (0, 0))
+    with pytest.raises(UnreadableUpload, match="DXF cannot be used"):
+        _read(document)
+
+
+# --- fitted polylines -------------------------------------------------------------------------------------------------
+
+_FRAME = [(0, 0), (70, 80), (130, -60), (200, 20)]
+
+
+@pytest.mark.parametrize("three_d", [False, True])
+def test_the_frame_of_a_spline_is_not_on_the_line(three_d: bool) -> None:
+    """AutoCAD's PEDIT stores the fitted vertices (flag 8) after those of the frame (flag 16)."""
+    document, space = _drawing()
+    x = np.linspace(0, 200, 21)
+    fitted = [(float(a), float(20 * np.sin(a / 32))) for a in x]
+    add = space.add_polyline3d if three_d else space.add_polyline2d
+    line = add([(*point, 0) if three_d else point for point in _FRAME + fitted], dxfattribs={"layer": "A"})
+    line.dxf.flags |= 4
+    for k, vertex in enumerate(line.vertices):
+        vertex.dxf.flags |= 16 if k < len(_FRAME) else 8
+    (lane,) = _read(document).lanes
+    assert lane.centre is not None
+    np.testing.assert_allclose(lane.centre[:, :2], fitted, atol=1e-9)
+
+
+def test_vertices_of_fitted_arcs_are_on_the_line() -> None:
+    document, space = _drawing()
+    points = [(0, 0, BULGE_90 / 2), (100, 0, BULGE_90), (120, 20, 0)]
+    line = space.add_polyline2d(points, format="xyb", dxfattribs={"layer": "A"})
+    line.dxf.flags |= 2
+    line.vertices[1].dxf.flags |= 1
+    (lane,) = _read(document).lanes
+    assert lane.centre is not None
+    assert lane.centre[0, :2].tolist() == [0, 0]
+    assert np.abs(lane.centre[:, :2] - (100, 0)).sum(axis=1).min() == 0.0
+
+
+def test_multilines_are_reported() -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0))
+    space.add_mline([(0, 9), (90, 9)], dxfattribs={"layer": "M"})
+    space.add_ellipse((0, 50), (40, 0), 0.5, dxfattribs={"layer": "E"})
+    assert _read(document).warnings[0].startswith("2 multilines and ellipses are left out, the first on layer M")
+
+
+@pytest.mark.parametrize(
+    ("page", "encoding", "name"),
+    [("ANSI_936", "gbk", "车道"), ("ANSI_932", "cp932", "車線"), ("ANSI_1251", "cp1251", "Полоса")],
+)
+def test_names_of_old_drawings_are_in_their_code_page(page: str, encoding: str, name: str) -> None:
+    document = ezdxf.new("R2000")
+    document.modelspace().add_line((0, 0), (90, 0), dxfattribs={"layer": "LANE"})
+    stream = io.StringIO()
+    document.write(stream)
+    text = stream.getvalue().replace("ANSI_1252", page).replace("LANE", name)
+    (lane,) = read_alignment(text.encode(encoding)).lanes
+    assert lane.name == name
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("code", "declared", "metres", "note"),
+    [
+        (2, {"crs": "EPSG:6539"}, 1200 / 3937, "read as ft-us, the unit of NAD83(2011) / New York Long Island (ftUS)"),
+        (1, {"crs": "EPSG:6539"}, 100 / 3937, "read as ft-us"),
+        (2, {"crs": "EPSG:2222"}, 0.3048, "read as ft-intl, the unit of NAD83 / Arizona East (ft)"),
+        (2, {"crs": "EPSG:26918"}, 0.3048, "read as ft-intl, because the CRS is not in feet"),
+        (2, {"origin": (8.4, 49.0)}, 0.3048, "read as ft-intl, because"),
+        (2, {"crs": "EPSG:6539", "unit": "ft-intl"}, 0.3048, ""),
+        (2, {"crs": "EPSG:26918", "unit": "ft-us"}, 1200 / 3937, ""),
+        (21, {"crs": "EPSG:2222"}, 1200 / 3937, ""),
+        (4, {"unit": "m"}, 1.0, "unit of the drawing is 0.001 m ($INSUNITS 4); the coordinates were read in the decl"),
+        (2, {"unit": "m"}, 1.0, "unit of the drawing is 0.3048 m ($INSUNITS 2)"),
+        (0, {"unit": "ft-us"}, 1200 / 3937, ""),
+        (6, {"unit": "m"}, 1.0, ""),
+    ],
+)
+def test_feet_are_those_of_the_crs_and_a_declared_unit_counts_more(
+    code: int, declared: dict[str, Any], metres: float, note: str
+) -> None:
+    document, space = _drawing(code)
+    space.add_lwpolyline([(0, 0, 0), (300, 0, BULGE_90), (400, 100, 0)], format="xyb", dxfattribs={"layer": "A"})
+    file = _read(document, **declared)
+    assert file.unit_m == pytest.approx(metres, rel=1e-12)
+    assert len(file.warnings) == bool(note)
+    assert note in "".join(file.warnings)
+    assert _chord_error(file.lanes[0], 100.0) * metres < 0.001, "arcs are sampled in the unit that is used"
 
 
 def test_what_cannot_be_read() -> None:

@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import quad
 
 from app.errors import UnreadableUpload, WaymarkError
-from app.formats.alignments.geometry import AlignmentFile, StationEquation
+from app.formats.alignments.curves import clothoid
+from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile, StationEquation
 from app.formats.alignments.landxml import read_landxml
 from app.formats.alignments.read import read_alignment
 from app.values import Floats
@@ -198,6 +199,145 @@ def test_station_equations() -> None:
     assert any("StaEquation 900" in warning for warning in outside.warnings)
 
 
+# --- feet -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("unit", "epsg", "declared", "metres", "note"),
+    [
+        ("foot", 6539, {}, US_FOOT_M, "read as ft-us, the unit of NAD83(2011) / New York Long Island (ftUS)"),
+        ("Foot", 2222, {}, 0.3048, "read as ft-intl, the unit of NAD83 / Arizona East (ft)"),
+        ("foot", 25832, {}, 0.3048, "read as ft-intl, because the CRS is not in feet"),
+        ("foot", None, {}, 0.3048, "read as ft-intl, because the CRS is not in feet"),
+        ("foot", None, {"crs": "EPSG:6539"}, US_FOOT_M, "read as ft-us"),
+        ("foot", 25832, {"unit": "ft-us"}, US_FOOT_M, ""),
+        ("foot", 6539, {"unit": "ft-intl"}, 0.3048, ""),
+        ("inch", 6539, {}, US_FOOT_M / 12, "read as ft-us"),
+        ("mile", 25832, {}, 1609.344, "read as ft-intl"),
+        ("USSurveyFoot", 2222, {}, US_FOOT_M, ""),
+    ],
+)
+def test_feet_are_those_of_the_crs_or_declared(
+    unit: str, epsg: int | None, declared: dict[str, str], metres: float, note: str
+) -> None:
+    head = f'<CoordinateSystem epsgCode="{epsg}"/>' if epsg else ""
+    data = landxml(FLAT, units=f'<Units><Imperial linearUnit="{unit}"/></Units>', head=head, sta=1e6)
+    file = read_alignment(data, declaration=AlignmentDeclaration(**declared))  # type: ignore[arg-type]
+    assert file.unit_m == pytest.approx(metres, rel=1e-12)
+    assert file.start_station_m == pytest.approx(1e6 * metres, rel=1e-12)
+    assert [note in warning for warning in file.warnings] == [True] * bool(note)
+
+
+# --- elements without length, and sides of turns ----------------------------------------------------------------------
+
+
+def test_elements_without_length_are_left_out() -> None:
+    here = ends((100, 0), (100, 0))
+    shape = (
+        line((0, 0), (100, 0)) + f'<Line length="0">{here}</Line>'
+        f'<Curve rot="cw" radius="100" length="0">{here}<Center>100 100</Center></Curve>'
+        f'<Spiral rot="cw" length="0" radiusStart="INF" radiusEnd="100">{here}</Spiral>'
+        f"<IrregularLine>{here}</IrregularLine>" + line((100, 0), (200, 0))
+    )
+    file = read_alignment(landxml(shape))
+    assert stations(file)[-1] == pytest.approx(200.0)
+    assert curvatures(file).tolist() == [0.0] * len(curvatures(file))
+    assert file.warnings == ("alignment CL: 4 elements of zero length are left out.",)
+    circle = f'<Curve rot="cw" radius="10" length="62.83">{ends((0, 0), (0, 0))}<Center>10 0</Center></Curve>'
+    with pytest.raises(UnreadableUpload, match="no arc of radius 10 joins"):
+        read_alignment(landxml(circle))
+
+
+def _clothoid_end(k0: float, k1: float, length: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """End of a clothoid from 0, 0 eastwards, and its PI on the tangents at both ends."""
+    u, v, turn, _k, _dk = (float(value[0]) for value in clothoid(*(np.array([x]) for x in (length, k0, k1, length))))
+    return (u, v), (u - v / math.tan(turn), 0.0)
+
+
+def _spiral(rot: str, side: int, *, pi: bool = True, r0: str = "INF", r1: str = "200") -> str:
+    k0, k1 = (0.0 if r == "INF" else side / float(r) for r in (r0, r1))
+    (u, v), (at, _) = _clothoid_end(k0, k1, 50.0)
+    stated = f"<PI>0 {100 + at:.4f}</PI>" if pi else ""
+    rot = f'rot="{rot}"' if rot else ""
+    points = f"<Start>0 100</Start>{stated}<End>{v:.4f} {100 + u:.4f}</End>"
+    return f'<Spiral {rot} spiType="clothoid" length="50" radiusStart="{r0}" radiusEnd="{r1}">{points}</Spiral>'
+
+
+SPIRALS = [("INF", "200"), ("400", "INF"), ("800", "150")]
+BEFORE = line((0, 0), (100, 0))
+
+
+@pytest.mark.parametrize(("r0", "r1"), SPIRALS)
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("rot", ["cw", "ccw", ""])
+@pytest.mark.parametrize(("pi", "before"), [(True, True), (True, False), (False, True)])
+def test_the_side_of_spirals_is_that_of_the_geometry(
+    r0: str, r1: str, side: int, rot: str, pi: bool, before: bool
+) -> None:
+    file = read_alignment(landxml(BEFORE * before + _spiral(rot, side, pi=pi, r0=r0, r1=r1)))
+    xy = centre(file)[:, :2]
+    heading = np.unwrap(np.arctan2(*np.diff(xy, axis=0).T[::-1]))
+    assert np.abs(np.diff(heading)).max() < 0.02, "no kink"
+    assert np.sign(xy[-1, 1]) == side
+    assert np.sign(curvatures(file)[np.abs(curvatures(file)).argmax()]) == side
+    right = rot == ("ccw" if side > 0 else "cw")
+    assert any("rot is missing or contradicts" in warning for warning in file.warnings) != right
+
+
+@pytest.mark.parametrize("rot", ["cw", "ccw", ""])
+@pytest.mark.parametrize("with_centre", [True, False])
+@pytest.mark.parametrize("with_pi", [True, False])
+@pytest.mark.parametrize("angle", [60, 270])
+def test_the_side_of_curves_is_that_of_the_geometry(rot: str, with_centre: bool, with_pi: bool, angle: int) -> None:
+    """To the left, after a line that is a tangent; arcs of more than 180 degrees have their PI behind the start."""
+    turn = math.radians(angle)
+    end = (100 + 80 * math.sin(turn), 80 - 80 * math.cos(turn))
+    parts = "<Center>80 100</Center>" * with_centre + f"<PI>0 {100 + 80 * math.tan(turn / 2)!r}</PI>" * with_pi
+    state = f'rot="{rot}"' if rot else ""
+    arc = f'<Curve {state} radius="80" length="{80 * turn!r}">{ends((100, 0), end)}{parts}</Curve>'
+    file = read_alignment(landxml(BEFORE + arc))
+    on_arc = curvatures(file) != 0
+    np.testing.assert_allclose(curvatures(file)[on_arc], 1 / 80)
+    np.testing.assert_allclose(np.hypot(*(centre(file)[on_arc, :2] - (100, 80)).T), 80, atol=1e-6)
+    assert stations(file)[-1] == pytest.approx(100 + 80 * turn)
+    assert any("rot is missing or contradicts" in warning for warning in file.warnings) == (rot != "ccw")
+
+
+def test_a_file_with_all_turns_mirrored_has_one_warning() -> None:
+    (u, v), _pi = _clothoid_end(0.0, 1 / 200, 50.0)
+    turn = 50 / 400
+    cos, sin = math.cos(turn), math.sin(turn)
+    last = (100 + u + 200 * (math.sin(turn + 0.5) - sin), v + 200 * (cos - math.cos(turn + 0.5)))
+    arc = f'<Curve rot="cw" radius="200" length="100">{ends((100 + u, v), last)}</Curve>'
+    after = line(last, (last[0] + 50 * math.cos(turn + 0.5), last[1] + 50 * math.sin(turn + 0.5)))
+    spiral = _spiral("cw", 1).replace(f"{v:.4f} {100 + u:.4f}", f"{v!r} {100 + u!r}")
+    file = read_alignment(landxml(BEFORE + spiral + arc + after))
+    assert curvatures(file).min() == 0.0
+    (warning,) = file.warnings
+    assert "curves and spirals is 2, and the first is Spiral at 100.000 from its start" in warning
+
+
+def test_turns_that_nothing_decides_are_refused() -> None:
+    with pytest.raises(UnreadableUpload, match="rot is missing, and nothing else shows"):
+        read_alignment(landxml(_spiral("", 1, pi=False)))
+    (u, v), (at, _) = _clothoid_end(0.0, -1 / 200, 50.0)
+    mirrored = _spiral("cw", -1).replace(f"<PI>0 {100 + at:.4f}</PI>", _mirrored_pi(u, v, at))
+    with pytest.raises(UnreadableUpload, match="contradict its PI and its length"):
+        read_alignment(landxml(BEFORE + mirrored))
+
+
+def _mirrored_pi(u: float, v: float, at: float) -> str:
+    """The PI on the other side of the chord."""
+    across = np.array([-v, u]) / math.hypot(u, v)
+    east, north = np.array([at, 0.0]) - 2 * (np.array([at, 0.0]) @ across) * across
+    return f"<PI>{float(north)!r} {100 + float(east)!r}</PI>"
+
+
+def test_a_pi_elsewhere_decides_nothing() -> None:
+    far = _spiral("ccw", 1).replace("<PI>0 1", "<PI>-9000 7")
+    assert read_alignment(landxml(BEFORE + far)).warnings == ()
+
+
 def test_reference_system() -> None:
     assert read_landxml(landxml(FLAT, head='<CoordinateSystem epsgCode="25832"/>')).crs == "EPSG:25832"
     unknown = read_landxml(landxml(FLAT, head='<CoordinateSystem epsgCode="99999"/>'))
@@ -215,7 +355,7 @@ GOOD_SPIRAL = f'<Spiral rot="cw" length="100" radiusStart="INF" radiusEnd="100">
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (landxml(line((0, 0), (0, 0))), "alignment CL, Line at 0.000 from its start: the length is 0 m"),
+        (landxml(line((0, 0), (0, 0))), "no alignment with a CoordGeom that has a length"),
         (landxml(FLAT + line((200.5, 0), (300, 0))), "Line at 200.000 from its start: the element before ends away"),
         (landxml(FLAT.replace("200", "nan")), "Line at 0.000 from its start: the easting is 'nan'"),
         (landxml(FLAT.replace("0 200", "0")), "End is '0'"),

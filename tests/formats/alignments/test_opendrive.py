@@ -380,3 +380,139 @@ def test_names_of_roads_where_unique() -> None:
     assert {lane.road for lane in read_opendrive(two).lanes} == {"Elm Street", "road 2"}
     assert len({lane.name for lane in read_opendrive(two).lanes}) == 4
     assert LEFT in two.decode()
+
+
+# --- records that begin after the start of the road -------------------------------------------------------------------
+
+
+def test_the_lane_offset_is_zero_before_its_first_record() -> None:
+    offset = '<laneOffset s="50" a="0" b="0" c="0.0042" d="-0.000056"/><laneOffset s="100" a="3.5" b="0" c="0" d="0"/>'
+    (lane,) = read_alignment(document(road(lanes=offset + section(left=""), length=200.0))).lanes
+    xy = centre(lane)[:, :2]
+    np.testing.assert_allclose(xy[xy[:, 0] <= 50.0, 1], -1.75, atol=1e-9)
+    np.testing.assert_allclose(np.interp([75.0, 100.0, 150.0], *xy.T), [0.0, 1.75, 1.75], atol=1e-3)
+    assert np.hypot(*np.diff(xy, axis=0).T).sum() == pytest.approx(200.15, abs=0.02)
+
+
+def test_the_lane_offset_of_a_bridge_is_zero_before_its_first_record() -> None:
+    bridge = '<objects><bridge id="3" s="0" length="30"/></objects>'
+    offset = '<laneOffset s="50" a="9" b="-0.3" c="0" d="0"/>'
+    file = read_alignment(document(road(lanes=offset + section(), extra=bridge)))
+    assert np.abs(file.areas[0].ring[:, 1]).max() == pytest.approx(3.5)
+
+
+def test_a_lane_without_a_width_is_absent() -> None:
+    late = LANE.format(-1, "").replace('sOffset="0" a="3.5" b="0"', 'sOffset="40" a="0" b="0.07"')
+    outside = LANE.format(-2, "")
+    file = read_alignment(document(road(lanes=section(left="", right=late + outside))))
+    inner, outer = (lanes(file)[f"road 7 lane {number}"] for number in (-1, -2))
+    assert values(inner.station_m)[0] == pytest.approx(40.0, abs=2.0)
+    assert values(inner.width_m).min() >= 0.05
+    assert any("road 7 lane -1" in warning and "left out" in warning for warning in file.warnings)
+    assert np.interp([0.0, 39.0, 90.0], *centre(outer)[:, :2].T) == pytest.approx([-1.75, -1.75, -5.25], abs=1e-6)
+
+
+def test_elevation_and_superelevation_are_zero_before_their_first_record() -> None:
+    extra = (
+        '<elevationProfile><elevation s="60" a="0" b="0.02" c="0" d="0"/></elevationProfile>'
+        '<lateralProfile><superelevation s="80" a="0" b="0.001" c="0" d="0"/></lateralProfile>'
+    )
+    file = read_alignment(document(road(lanes=section(left=""), extra=extra)))
+    (lane,) = file.lanes
+    s, z, roll = values(lane.station_m), centre(lane)[:, 2], values(lane.superelevation_rad)
+    assert np.interp([0.0, 60.0, 80.0], s, z) == pytest.approx([0.0, 0.0, 0.4], abs=1e-9)
+    assert np.interp([0.0, 80.0, 100.0], s, roll) == pytest.approx([0.0, 0.0, 0.02], abs=1e-9)
+    assert any("no elevation before s 60.000 m" in warning for warning in file.warnings)
+    step = document(road(lanes=section(left=""), extra=extra.replace('s="60" a="0"', 's="60" a="120"')))
+    assert [round(float(centre(lane)[0, 2])) for lane in read_alignment(step).lanes] == [0, 120], "divided at the step"
+
+
+def test_a_plan_that_begins_late_has_no_lanes_before() -> None:
+    plan = '<geometry s="10" x="0" y="0" hdg="0" length="90"><line/></geometry>'
+    file = read_alignment(document(road(plan, lanes=section(left=""))))
+    (lane,) = file.lanes
+    assert values(lane.station_m)[[0, -1]].tolist() == [10.0, 100.0]
+    assert centre(lane)[[0, -1], 0].tolist() == [0.0, 90.0]
+    assert any("planView begins at s 10.000 m" in warning for warning in file.warnings)
+    sections = read_alignment(document(road(lanes=section(25.0, left=""))))
+    assert values(sections.lanes[0].station_m)[0] == 25.0
+    assert any("first lane section begins at s 25.000 m" in warning for warning in sections.warnings)
+
+
+def test_geometries_without_length_are_left_out() -> None:
+    shapes = [(0, 0, 50, "<line/>"), (50, 50, 0, "<line/>"), (50, 50, 0, '<arc curvature="0.01"/>')]
+    shapes += [(50, 50, 0, '<spiral curvStart="0" curvEnd="0.01"/>'), (50, 50, 50, "<line/>")]
+    plan = "".join(
+        f'<geometry s="{s}" x="{x}" y="0" hdg="0" length="{length}">{shape}</geometry>'
+        for s, x, length, shape in shapes
+    )
+    file = read_alignment(document(road(plan, lanes=section(left=""))))
+    assert np.ptp(centre(file.lanes[0])[:, 0]) == 100.0
+    assert file.warnings == ("road 7: 3 geometries of zero length are left out.",)
+
+
+# --- directions and revisions of 1.8 ----------------------------------------------------------------------------------
+
+
+def _revised(major: str, minor: str, **parts: str) -> AlignmentFile:
+    text = document(road(**parts)).decode()  # type: ignore[arg-type]
+    return read_alignment(text.replace('revMajor="1" revMinor="7"', f'revMajor="{major}" revMinor="{minor}"').encode())
+
+
+def _directed(number: int, direction: str, inside: str = "") -> str:
+    return LANE.format(number, inside).replace('type="driving"', f'type="driving" {direction}')
+
+
+@pytest.mark.parametrize("rule", ["RHT", "LHT"])
+@pytest.mark.parametrize("number", [-2, 2])
+def test_reversed_lanes_run_against_their_side(rule: str, number: int) -> None:
+    side = 1 if number > 0 else -1
+    marks = '<roadMark sOffset="0" type="solid"/>'
+    both = LANE.format(side, '<roadMark sOffset="0" type="broken"/>')
+    both += _directed(number, 'direction="reversed"', marks)
+    found = lanes(
+        _revised("1", "8", lanes=section(left=both, right="") if number > 0 else section(left="", right=both),
+                 attributes=f'id="7" junction="-1" rule="{rule}"')
+    )  # fmt: skip
+    usual, against = (found[f"road 7 lane {n}"] for n in (side, number))
+    eastward = (number < 0) == (rule == "RHT")
+    assert np.sign(centre(usual)[-1, 0] - centre(usual)[0, 0]) == (1 if eastward else -1)
+    assert np.sign(centre(against)[-1, 0] - centre(against)[0, 0]) == (-1 if eastward else 1)
+    # The broken line lies between the two lanes: on the left of both vehicles, or on the right of both.
+    outer_is_left = (centre(against)[-1, 0] > centre(against)[0, 0]) == (number > 0)
+    expected = (BoundaryStyle.SOLID, BoundaryStyle.DASHED)
+    assert (against.left_style, against.right_style) == (expected if outer_is_left else expected[::-1])
+
+
+def test_a_lane_that_changes_its_direction_is_two_lanes() -> None:
+    ahead = _directed(-1, 'direction="standard"', '<link><successor id="-1"/></link>')
+    back = _directed(-1, 'direction="reversed"', '<link><predecessor id="-1"/></link>')
+    found = lanes(_revised("1", "8", lanes=section(left="", right=ahead) + section(60, left="", right=back)))
+    first, second = found.values()
+    assert centre(first)[[0, -1], 0].tolist() == [0.0, 60.0]
+    assert centre(second)[[0, -1], 0].tolist() == [100.0, 60.0]
+
+
+@pytest.mark.parametrize(
+    ("direction", "warning"),
+    [
+        ('direction="both"', "drive on it both ways"),
+        ('direction="sideways"', "this direction is not known"),
+        ('dynamicLaneDirection="true"', "direction of travel changes"),
+        ('dynamicLaneDirection="false" direction="standard"', ""),
+    ],
+)
+def test_other_directions_are_reported(direction: str, warning: str) -> None:
+    file = _revised("1", "8", lanes=section(left="", right=_directed(-1, direction)))
+    assert centre(file.lanes[0])[0, 0] == 0.0
+    assert [one for one in file.warnings if "road 7, lane -1 at s 0" in one and warning in one] == list(file.warnings)
+    assert len(file.warnings) == bool(warning)
+
+
+@pytest.mark.parametrize(
+    ("major", "minor", "newer"),
+    [("1", "4", False), ("1", "8", False), ("1", "9", True), ("2", "0", True), ("1", "x", False), ("", "", False)],
+)
+def test_newer_revisions_are_reported(major: str, minor: str, newer: bool) -> None:
+    file = _revised(major, minor)
+    assert [f"revision {major}.{minor} of OpenDRIVE" in warning for warning in file.warnings] == [True] * newer

@@ -32,7 +32,7 @@ def piece(shape: str, length: str = "50") -> bytes:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (piece("<line/>", "0"), "road 7, geometry at s 0: the length is 0 m"),
+        (piece("<line/>", "0"), "road 7: the planView has geometries of zero length only"),
         (piece("<line/>", "-3"), "road 7, geometry at s 0: the length is -3 m"),
         (piece("<line/>", "nan"), "road 7, geometry at s 0: length is 'nan'"),
         (piece("<line/>", "1e8"), "needs 1.5e+08 vertices"),
@@ -59,7 +59,7 @@ def piece(shape: str, length: str = "50") -> bytes:
         (document()[:-20], "not XML"),
         (b"", "not XML"),
         (b'<OpenDRIVE><q:road id="1"/></OpenDRIVE>', "not XML: unbound prefix"),
-        (b'<?xml version="1.0" encoding="utf-77"?><OpenDRIVE/>', "not XML"),
+        (b'<?xml version="1.0" encoding="utf-77"?><OpenDRIVE/>', "declares the encoding 'utf-77'"),
         (b"\x00\xff" * 100, "not XML"),
         (b"<OpenDRIVE>" + b"<a>" * 200 + b"</a>" * 200 + b"</OpenDRIVE>", "nested too deeply"),
         (b'<!DOCTYPE o [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><OpenDRIVE>&b;</OpenDRIVE>', "document type"),

@@ -10,10 +10,10 @@ import pytest
 from pyproj import Geod
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import BoundaryStyle
+from app.formats.alignments.geometry import AlignmentDeclaration, BoundaryStyle
 from app.formats.alignments.read import RegisteredRoad, RoadLanes, read_alignment, write_registered_road
 from app.geodesy import LocalizationGrade
-from app.planning.alignment import Alignment, AlignmentDeclaration
+from app.planning.alignment import Alignment
 from app.planning.build_alignment import build_alignment
 from app.roads.axis import Axis
 from app.roads.lane_line import CalibrationPoint, cut_edges

@@ -260,6 +260,46 @@ def test_a_drawing_in_millimetres() -> None:
     assert kept.first[0] == 456_789_123.0
 
 
+def test_points_that_are_not_drawn_are_left_out() -> None:
+    document = ezdxf.new("R2010", units=6)
+    document.layers.add("OLD").freeze()
+    document.layers.add("OFF").off()
+    for layer in ("NEW", "old", "OFF"):
+        document.modelspace().add_point((456789.0, 5427345.0, 112.0), dxfattribs={"layer": layer})
+    text = io.StringIO()
+    document.write(text)
+    read = _read(text.getvalue())
+    assert read.first.tolist() == [456789.0]
+    assert read.faults.counts == {"hidden_layers": 1}
+    with pytest.raises(
+        UnreadableUpload, match=r"no points that are drawn\. The layers OFF, old are frozen or switched off"
+    ):
+        _read(text.getvalue(), layer="OLD")
+
+
+def test_points_in_bound_references() -> None:
+    document = ezdxf.new("R2010", units=6)
+    symbol = document.blocks.new("PEG")
+    symbol.add_point((0, 0))
+    symbol.add_circle((0, 0), 0.2)
+    part = document.blocks.new("survey$0$points")
+    part.add_point((10.0, 0.0, 112.0))
+    part.add_point((20.0, 0.0, 112.0), dxfattribs={"layer": "own"})
+    part.add_blockref("PEG", (30.0, 0.0, 112.0)).add_attrib("NAME", "P3", (0, 0))
+    space = document.modelspace()
+    space.add_blockref("PEG", (456000.0, 5427000.0, 112.0)).add_attrib("NAME", "P1", (0, 0))
+    space.add_blockref("PEG", (456001.0, 5427000.0, 112.0))
+    space.add_blockref("survey$0$points", (456000.0, 5427345.0), dxfattribs={"layer": "host", "rotation": 90})
+    text = io.StringIO()
+    document.write(text)
+    read = _read(text.getvalue(), columns={"point": "name"})
+    assert read.first.tolist() == pytest.approx([456000, 456001, 456000, 456000, 456000])
+    assert read.second.tolist() == pytest.approx([5427000, 5427000, 5427355, 5427365, 5427375])
+    assert list(read.texts["point"]) == ["P1", "", "", "", "P3"]
+    of_layer = _read(text.getvalue(), layer="host", columns={"point": "name"})
+    assert of_layer.second.tolist() == pytest.approx([5427355, 5427375])
+
+
 def test_multipoints_of_geojson() -> None:
     many = {"type": "MultiPoint", "coordinates": [[8.4164, 49.0051], [8.4165, 49.0052], [8.4166, "x"]]}
     one = {"type": "Point", "coordinates": [8.4167, 49.0053]}

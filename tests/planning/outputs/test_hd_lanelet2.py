@@ -15,9 +15,9 @@ from lanelet2.core import GPSPoint
 from lanelet2.io import Origin
 from lanelet2.projection import UtmProjector
 
-from app.formats.alignments.geometry import BoundaryStyle, EventKind
+from app.formats.alignments.geometry import AlignmentDeclaration, BoundaryStyle, EventKind
 from app.formats.alignments.read import read_alignment
-from app.planning.alignment import Alignment, AlignmentDeclaration, Lane, RoadEvent
+from app.planning.alignment import Alignment, Lane, RoadEvent
 from app.planning.build_alignment import build_alignment
 from app.planning.outputs.hd_lanelet2 import write_lanelet2
 from app.planning.outputs.hd_map import HdMap, MapMarker, map_of_plan

@@ -16,9 +16,9 @@ from lxml import etree
 from pyproj import Transformer
 
 from app.errors import InvalidParameter
-from app.formats.alignments.geometry import BoundaryStyle
+from app.formats.alignments.geometry import AlignmentDeclaration, BoundaryStyle
 from app.formats.alignments.read import read_alignment
-from app.planning.alignment import Alignment, AlignmentDeclaration, Lane
+from app.planning.alignment import Alignment, Lane
 from app.planning.build_alignment import build_alignment
 from app.planning.outputs.hd_map import HdMap, MapMarker, map_of_plan
 from app.planning.outputs.hd_opendrive import write_opendrive

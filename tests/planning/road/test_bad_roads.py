@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
-from app.planning.alignment import AlignmentDeclaration
+from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile, LaneGeometry
 from app.planning.build_alignment import build_alignment
 from app.planning.rules import RoadRules
 

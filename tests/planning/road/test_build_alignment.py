@@ -11,6 +11,7 @@ from pyproj import CRS, Geod, Transformer
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.alignments.geometry import (
+    AlignmentDeclaration,
     AlignmentFile,
     AreaGeometry,
     EventGeometry,
@@ -18,7 +19,7 @@ from app.formats.alignments.geometry import (
     LaneGeometry,
 )
 from app.geodesy import LocalizationGrade
-from app.planning.alignment import Alignment, AlignmentDeclaration, Lane
+from app.planning.alignment import Alignment, Lane
 from app.planning.build_alignment import build_alignment
 from app.planning.rules import RoadRules
 
@@ -232,6 +233,27 @@ def test_local_coordinates_need_an_origin_and_are_not_surveyed() -> None:
     assert azimuth == pytest.approx(30.0, abs=1e-6)
     assert distance == pytest.approx(100.0, abs=1e-6)
     assert any("origin" in warning for warning in alignment.warnings)
+
+
+@pytest.mark.parametrize(
+    ("points", "crs", "exchanged"),
+    [
+        ([[5_430_000.0, 456_000.0], [5_430_100.0, 456_000.0]], "EPSG:25832", True),
+        ([[49.0, 8.4], [49.001, 8.4]], "EPSG:4258", True),
+        ([[42.3, -83.0], [42.301, -83.0]], "EPSG:6318", True),
+        ([[200_000.0, 986_000.0], [200_000.0, 986_300.0]], "EPSG:6539", True),
+        ([[9_456_000.0, 430_000.0], [9_456_100.0, 430_000.0]], "EPSG:25832", False),
+        ([[140.0, 8.4], [140.001, 8.4]], "EPSG:4258", False),
+    ],
+)
+def test_exchanged_coordinates_are_named_where_the_area_of_use_shows_them(
+    points: list[list[float]], crs: str, exchanged: bool
+) -> None:
+    lane = LaneGeometry("1", np.column_stack([points, [0.0, 0.0]]))
+    with pytest.raises(InvalidParameter, match="outside the area of use") as refused:
+        _declared(lane, crs=crs)
+    assert ("inside it if the two coordinates are exchanged" in refused.value.message) == exchanged
+    assert ("exchange the two" in str(refused.value.cure)) == exchanged
 
 
 def test_the_problem_of_a_reference_is_reported() -> None:

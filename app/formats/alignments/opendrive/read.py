@@ -218,6 +218,8 @@ def _carriageway(road: Road, grid: Grid, start: float, end: float) -> Floats | N
 # === A file of OpenDRIVE.
 
 
+NEWEST = (1, 8)
+"""Newest revision of OpenDRIVE that is read, major and minor."""
 MAX_WARNINGS = 100
 """Warnings that are kept, the number of the others in one more."""
 Offset = tuple[float, float, float, float]
@@ -225,7 +227,7 @@ Offset = tuple[float, float, float, float]
 
 
 def read_opendrive(data: bytes) -> AlignmentFile:
-    """Lanes that vehicles drive on, stop lines, crossings, speed limits and bridges of an OpenDRIVE file (1.4 to 1.7).
+    """Lanes that vehicles drive on, stop lines, crossings, speed limits and bridges of an OpenDRIVE file (1.4 to 1.8).
 
     Every lane has the direction in which vehicles drive on it, by the road's rule (right-hand traffic without one), and
     is named by its road and lane number. Sections are joined where the file links them; roads are not. The stations are
@@ -293,7 +295,7 @@ def _place(
     reference = root.find("header/geoReference")
     text = None if reference is None else "".join(reference.itertext())
     crs, problem = usable_crs(text, float(x), float(y))
-    warnings = [warning for road in roads for warning in road.warnings]
+    warnings = [*_newer_revision(root), *(warning for road in roads for warning in road.warnings)]
     if crs is None and any(offset):
         warnings.append("The header's offset is not applied, because the geoReference cannot be used.")
         offset = (0.0, 0.0, 0.0, 0.0)
@@ -312,6 +314,18 @@ def _place(
         areas=tuple(AreaGeometry(area.kind, _moved(area.ring, offset)) for area in furniture.areas),
         warnings=tuple(warnings),
     )
+
+
+def _newer_revision(root: ET.Element) -> list[str]:
+    header = root.find("header")
+    stated = [header.get(name, "").strip() if header is not None else "" for name in ("revMajor", "revMinor")]
+    if not all(_whole(text) for text in stated) or tuple(map(int, stated)) <= NEWEST:
+        return []
+    newest = ".".join(map(str, NEWEST))
+    return [
+        f"The file has revision {'.'.join(stated)} of OpenDRIVE, which is newer than {newest}. What newer revisions "
+        "changed is not read; compare the lanes with a map."
+    ]
 
 
 def _centre(track: Track) -> Floats:

@@ -14,13 +14,22 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import UnreadableUpload
-from app.formats.alignments.curves import GAP_ERROR_M, GAP_WARNING_M, Curve, Frame, Piece, build_curve, sample
+from app.formats.alignments.curves import (
+    GAP_ERROR_M,
+    GAP_WARNING_M,
+    NO_LENGTH_M,
+    Curve,
+    Frame,
+    Piece,
+    build_curve,
+    sample,
+)
 from app.formats.alignments.geometry import BoundaryStyle, LaneGeometry
 from app.formats.xml_tree import attribute
 from app.values import Floats, Ints
 
-LANE_TYPES = frozenset({"driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp"})
-"""Lanes that vehicles drive on. Source: ASAM OpenDRIVE 1.7, e_laneType."""
+LANE_TYPES = frozenset({"driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"})
+"""Lanes that vehicles drive on. Source: ASAM OpenDRIVE 1.8, e_laneType."""
 _LANE_ID = re.compile(r"-?[0-9]{1,9}")
 _SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 _STYLES = {
@@ -33,18 +42,18 @@ _STYLES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cubics:
-    """A value along the road: cubics in the distance from the start of each, ``a b c d``; zero without any."""
+    """A value along the road: cubics in the distance from the start of each, ``a b c d``; zero before the first one."""
 
     starts: Floats  # shape (n,)
     abcd: Floats  # shape (n, 4)
 
     def at(self, s: Floats, lookup: Floats) -> tuple[Floats, Floats, Floats]:
-        """Value and first two derivatives at s, by the cubics that apply at `lookup`, the first one before it."""
+        """Value and first two derivatives at s, by the cubics that apply at `lookup`."""
         if not len(self.starts):
             return np.zeros_like(s), np.zeros_like(s), np.zeros_like(s)
-        i = np.maximum(np.searchsorted(self.starts, lookup, side="right") - 1, 0)
+        i = np.searchsorted(self.starts, lookup, side="right") - 1
         d = s - self.starts[i]
-        a, b, c, e = self.abcd[i].T
+        a, b, c, e = np.where(i >= 0, self.abcd[i].T, 0.0)
         return a + d * (b + d * (c + d * e)), b + d * (2.0 * c + 3.0 * d * e), 2.0 * c + 6.0 * d * e
 
 
@@ -54,6 +63,7 @@ class LaneRecord:
 
     id: int  # negative right of the reference line
     drivable: bool
+    reversed: bool  # whether vehicles drive against the direction of its side of the road
     width: Cubics  # [m] in s of the road
     # paint of the outer border from s on: style of the line nearer to the reference line, and of the other one
     marks: list[tuple[float, tuple[BoundaryStyle, BoundaryStyle]]]
@@ -104,13 +114,22 @@ def parse_road(element: ET.Element) -> Road:
     """
     road_id = element.get("id", "")[:40]
     place = f"road {road_id}"
-    curve = build_curve(_pieces(element, place))
-    warnings = list(curve.warnings)
+    warnings: list[str] = []
+    curve = build_curve(_pieces(element, place, warnings))
+    warnings += curve.warnings
+    start = float(curve.s[0])
+    if abs(start) > GAP_WARNING_M:
+        warnings.append(f"{place}: the planView begins at s {start:.3f} m; the road has no lanes before it.")
     stated = attribute(element, "length", place, curve.end_s)
     if abs(stated - curve.end_s) > GAP_WARNING_M:
         warnings.append(f"{place}: the geometries end at s {curve.end_s:.3f} m, not at the length {stated:.3f} m.")
     if any(attribute(shape, key, place, 0.0) for shape in element.iterfind("lateralProfile/shape") for key in "abcd"):
         warnings.append(f"{place}: the shape of the lateral profile is left out; heights are those without it.")
+    if element.find("lateralProfile/crossSectionSurface") is not None:
+        warnings.append(f"{place}: the crossSectionSurface is left out; heights are those without it.")
+    elevation = _cubics(element.findall("elevationProfile/elevation"), place)
+    if len(elevation.starts) and elevation.starts[0] - max(start, 0.0) > GAP_WARNING_M:
+        warnings.append(f"{place}: the file states no elevation before s {elevation.starts[0]:.3f} m; it is 0 there.")
     link = {end: element.find(f"link/{end}") for end in ("predecessor", "successor")}
     meets = {end: at is not None and at.get("elementType") == "junction" for end, at in link.items()}
     junction = element.get("junction", "-1")
@@ -124,27 +143,35 @@ def parse_road(element: ET.Element) -> Road:
         left_hand=element.get("rule", "RHT").upper() == "LHT",
         curve=curve,
         offset=_cubics(element.findall("lanes/laneOffset"), place),
-        elevation=_cubics(element.findall("elevationProfile/elevation"), place),
+        elevation=elevation,
         superelevation=_cubics(element.findall("lateralProfile/superelevation"), place),
-        sections=_sections(element, place, curve.end_s),
+        sections=_sections(element, place, (max(start, 0.0), curve.end_s), warnings),
         speeds=_speeds(element.findall("type"), place),
         element=element,
         warnings=warnings,
     )
 
 
-def _pieces(road: ET.Element, place: str) -> list[Piece]:
+def _pieces(road: ET.Element, place: str, warnings: list[str]) -> list[Piece]:
     geometries = road.findall("planView/geometry")
-    if not geometries:
+    pieces = [piece for geometry in geometries if (piece := _piece(geometry, place)) is not None]
+    if not pieces:
+        state = "has geometries of zero length only" if geometries else "has no geometry"
         raise UnreadableUpload(
-            f"{place}: the planView has no geometry", field="file", limit="one or more", cure="export the file again"
+            f"{place}: the planView {state}", field="file", limit="one or more", cure="export the file again"
         )
-    return [_piece(geometry, place) for geometry in geometries]
+    if len(pieces) < len(geometries):
+        count = len(geometries) - len(pieces)
+        warnings.append(f"{place}: {count} geometries of zero length are left out.")
+    return pieces
 
 
-def _piece(geometry: ET.Element, place: str) -> Piece:
+def _piece(geometry: ET.Element, place: str) -> Piece | None:
+    """The piece of a geometry; None if it has no length."""
     place = f"{place}, geometry at s {geometry.get('s', '?')[:24]}"
     s, x, y, hdg, length = (attribute(geometry, name, place) for name in ("s", "x", "y", "hdg", "length"))
+    if 0.0 <= length < NO_LENGTH_M:
+        return None
     base = Piece(place, s, length, x, y, math.remainder(hdg, math.tau))
     kinds = [child for child in geometry if child.tag != "userData"]
     kind = kinds[0].tag if len(kinds) == 1 else None
@@ -172,7 +199,7 @@ def _piece(geometry: ET.Element, place: str) -> Piece:
         f"{place}: the geometry is {found}",
         field="file",
         limit="one of line, arc, spiral, poly3, paramPoly3",
-        cure="export the file as OpenDRIVE 1.4 to 1.7",
+        cure="export the file as OpenDRIVE 1.4 to 1.8",
     )
 
 
@@ -192,7 +219,8 @@ def _cubics(elements: list[ET.Element], place: str, start: float | None = None) 
     return Cubics(table[:, 0], table[:, 1:])
 
 
-def _sections(road: ET.Element, place: str, end: float) -> tuple[Section, ...]:
+def _sections(road: ET.Element, place: str, span: tuple[float, float], warnings: list[str]) -> tuple[Section, ...]:
+    """Lane sections between two distances along the road."""
     elements = road.findall("lanes/laneSection")
     starts = [attribute(element, "s", f"{place}, laneSection") for element in elements]
     if any(b <= a for a, b in pairwise(starts)):
@@ -203,17 +231,21 @@ def _sections(road: ET.Element, place: str, end: float) -> tuple[Section, ...]:
             cure="sort the lane sections, and remove those that stand twice",
         )
     found = []
-    for element, start, stop in zip(elements, starts, [*starts, end][1:], strict=True):
-        if stop - start > GAP_WARNING_M:
+    if starts and starts[0] - span[0] > GAP_WARNING_M:
+        warnings.append(f"{place}: the first lane section begins at s {starts[0]:.3f} m; there are no lanes before it.")
+    for element, start, stop in zip(elements, starts, [*starts, span[1]][1:], strict=True):
+        if stop - max(start, span[0]) > GAP_WARNING_M:
             lanes = [
-                _lane(lane, place, start) for side in ("left", "right") for lane in element.iterfind(f"{side}/lane")
+                _lane(lane, place, start, warnings)
+                for side in ("left", "right")
+                for lane in element.iterfind(f"{side}/lane")
             ]
-            centre = [_lane(lane, place, start) for lane in element.iterfind("center/lane")]
-            found.append(Section(max(start, 0.0), stop, {lane.id: lane for lane in centre[:1] + lanes}))
+            centre = [_lane(lane, place, start, warnings) for lane in element.iterfind("center/lane")]
+            found.append(Section(max(start, span[0]), stop, {lane.id: lane for lane in centre[:1] + lanes}))
     return tuple(found)
 
 
-def _lane(lane: ET.Element, place: str, start: float) -> LaneRecord:
+def _lane(lane: ET.Element, place: str, start: float, warnings: list[str]) -> LaneRecord:
     number = lane.get("id", "")
     place = f"{place}, lane {number[:12]} at s {start:g}"
     lane_id = _integer(number)
@@ -230,12 +262,24 @@ def _lane(lane: ET.Element, place: str, start: float) -> LaneRecord:
             limit="elements width",
             cure="export lanes with widths; borders are not read",
         )
+    direction = lane.get("direction", "standard")
+    if drivable and direction not in ("standard", "reversed"):
+        state = "vehicles drive on it both ways" if direction == "both" else "this direction is not known"
+        warnings.append(
+            f"{place}: its direction is {direction[:20]!r} ({state}); it is read in the direction of its side of the "
+            "road."
+        )
+    if drivable and lane.get("dynamicLaneDirection", "false") in ("true", "1"):
+        warnings.append(
+            f"{place}: its direction of travel changes (dynamicLaneDirection); it is read in its usual direction only."
+        )
     links = {
         end: _integer(at.get("id", "")) for end in ("predecessor", "successor") for at in lane.iterfind(f"link/{end}")
     }
     return LaneRecord(
         id=lane_id,
         drivable=drivable,
+        reversed=direction == "reversed",
         width=_cubics(widths, place, start),
         marks=sorted(
             (
@@ -402,7 +446,8 @@ def build_tracks(road: Road, grid: Grid, names: set[str], road_name: str) -> lis
     tracks = []
     for chain in _chains(road.sections):
         first = chain[0]
-        forward = (first[1] < 0) != road.left_hand
+        against = road.sections[first[0]].lanes[first[1]].reversed
+        forward = ((first[1] < 0) != road.left_hand) != against
         table = np.concatenate([parts[key] for key in chain])
         styles = _lane_styles(road, chain)
         ids = [(road.sections[i].start, road.sections[i].end, lane) for i, lane in chain]
@@ -494,6 +539,7 @@ def _chains(sections: tuple[Section, ...]) -> list[list[tuple[int, int]]]:
             next_id = lane.successor if lane.successor is not None else next(backwards, None)
             found = after.lanes.get(next_id) if next_id is not None else None
             usable = lane.drivable and found is not None and found.drivable and found.id * lane.id > 0
+            usable = usable and found is not None and found.reversed == lane.reversed
             if found is not None and usable and (i + 1, found.id) not in following.values():
                 following[i, lane.id] = (i + 1, found.id)
     taken = set(following.values())
@@ -568,7 +614,8 @@ def _lane_styles(road: Road, chain: list[tuple[int, int]]) -> tuple[BoundaryStyl
                 covered += part
             lengths[side][BoundaryStyle.UNKNOWN] += section.end - section.start - covered
     inner, outer = (max(part, key=lambda style: part[style]) for part in lengths)
-    return (outer, inner) if road.left_hand else (inner, outer)
+    against = road.sections[chain[0][0]].lanes[chain[0][1]].reversed
+    return (outer, inner) if road.left_hand != against else (inner, outer)
 
 
 def _inside(section: Section, number: int) -> int:
