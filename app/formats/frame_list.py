@@ -15,9 +15,10 @@ import numpy as np
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.formats.format import NAME_LENGTH, Sample
-from app.formats.logs import LogReport
-from app.formats.poses import ALIASES, PoseDeclaration, check_datum, find_jumps
+from app.formats.logs import LogReport, check_datum
+from app.formats.poses import ALIASES, PoseDeclaration
 from app.formats.text import clean_text, match_columns, read_number
+from app.sensors.pose_track import find_jumps
 
 FRAME_LISTS = ("frames.csv", "frames.json")
 """Names of the files, in any folder of an archive."""
