@@ -606,7 +606,8 @@ def _points(epochs: list[_Epoch], clock: LogClock, day: date | None, report: Log
             "no sentence has a date (RMC or ZDA)", field="poses.date", cure="declare the UTC date of the first position"
         )
     current = _day_of_first(epochs, first) if first is not None else day
-    last_s = math.nan
+    last_s = midnight_s = math.nan
+    dated: date | None = None
     for epoch in epochs:
         if epoch.day is not None:
             current = epoch.day
@@ -617,14 +618,13 @@ def _points(epochs: list[_Epoch], clock: LogClock, day: date | None, report: Log
             if epoch.void:
                 report.leave_out(epoch.entry, "no-fix", "the receiver reports that it has no position")
             continue
-        assert current is not None
-        heading_deg = epoch.course_deg if math.isnan(epoch.heading_deg) else epoch.heading_deg
-        at_s = clock.read(datetime.combine(current, time(), UTC).isoformat()) + epoch.second_s
-        if math.isnan(at_s):
-            report.leave_out(
-                epoch.entry, "no-time", f"the date {current} is not between 2000 and 2100; {ROLLOVER_CURE}"
-            )
+        if current is not None and current != dated:
+            dated, midnight_s = current, clock.read(datetime.combine(current, time(), UTC).isoformat())
+        if math.isnan(midnight_s):
+            report.leave_out(epoch.entry, "no-time", f"{current} is not between 2000 and 2100; {ROLLOVER_CURE}")
             continue
+        heading_deg = epoch.course_deg if math.isnan(epoch.heading_deg) else epoch.heading_deg
+        at_s = midnight_s + epoch.second_s
         yield PosePoint(epoch.entry, at_s, epoch.lon_deg, epoch.lat_deg, heading_deg, epoch.accuracy_m)
 
 
