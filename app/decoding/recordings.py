@@ -34,7 +34,7 @@ from app.errors import UnreadableUpload, naming
 from app.formats.format import SpooledFile
 from app.formats.images import ImageHeader, ImageLimits, inspect_image
 from app.formats.kinds import detect_drive_file
-from app.formats.logs import LogReport
+from app.formats.logs import LogReport, describe_rollover
 from app.formats.packets.read import read_packets
 from app.formats.packets.rows import PacketLimits
 from app.formats.poses import read_poses
@@ -230,6 +230,7 @@ class ReadPackets:
     grade: LocalizationGrade
     localization_warnings: tuple[str, ...]
     verify_ms: float
+    warnings: tuple[str, ...] = ()  # about the track
 
 
 def read_packets_of(
@@ -254,6 +255,9 @@ def read_packets_of(
     verification, merged = match_known_markers(
         files.packets, key_of, known.cerpms, files.track, freshness, rules, max_invalid_tags=max_invalid_tags
     )
+    rollover = None
+    if files.track is not None:
+        rollover = describe_rollover(float(files.track.time_s[0]), observed_at.timestamp())
     merged = _at_epoch(merged, known.rows, decimal_year(_driven_at(files) or observed_at))
     places = {
         int(number): (float(lon), float(lat))
@@ -261,9 +265,9 @@ def read_packets_of(
     }
     signal = profile_signals(verification.packets, places, files.track, SignalRules.of(declared.receiver))
     grade, localization_warnings = grade_markers(merged, verification, known.cerpms)
-    return ReadPackets(
-        verification, merged, signal, known, grade, localization_warnings, 1e3 * (time.perf_counter() - began)
-    )
+    verify_ms = 1e3 * (time.perf_counter() - began)
+    warnings = (rollover,) if rollover else ()
+    return ReadPackets(verification, merged, signal, known, grade, localization_warnings, verify_ms, warnings)
 
 
 def lane_markers(read: ReadPackets) -> LaneMarkers:

@@ -15,9 +15,10 @@ import numpy as np
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.formats.format import NAME_LENGTH, Sample
-from app.formats.logs import LogReport
-from app.formats.poses import ALIASES, PoseDeclaration, check_datum, find_jumps
+from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, check_datum
+from app.formats.poses import ALIASES, PoseDeclaration
 from app.formats.text import clean_text, match_columns, read_number
+from app.sensors.pose_track import find_jumps
 
 FRAME_LISTS = ("frames.csv", "frames.json")
 """Names of the files, in any folder of an archive."""
@@ -83,14 +84,17 @@ def read_frame_list(name: str, data: bytes, declaration: PoseDeclaration | None 
     UnreadableUpload
         It is no JSON, or no list of objects.
     InvalidParameter
-        A column is missing.
+        A column is missing, or dates do not show the order of day and month.
     ReferenceSystemError
         The positions have another datum than WGS 84.
     """
     declaration, report = declaration or PoseDeclaration(), LogReport(format="frames")
     if len(data) > MAX_LIST_BYTES:
         raise UploadTooLarge(f"{name} has {len(data)} bytes", field="file", limit=f"{MAX_LIST_BYTES} bytes")
-    rows = _json_rows(name, data, declaration) if name.lower().endswith(".json") else _csv_rows(name, data, declaration)
+    read_rows = _json_rows if name.lower().endswith(".json") else _csv_rows
+    rows = list(read_rows(name, data, declaration))
+    texts = (str(values.get("time", "")) for _entry, values in rows if values is not None)
+    clock = declaration.times.of_column(texts, "poses.clock.day_first")
     listed: dict[str, ListedFrame] = {}
     seen: set[str] = set()
     for entry, values in rows:
@@ -98,7 +102,10 @@ def read_frame_list(name: str, data: bytes, declaration: PoseDeclaration | None 
         if values is None:
             report.leave_out(entry, "malformed", "the row cannot be read")
             continue
-        frame = _frame_of(values, declaration)
+        frame = _frame_of(values, declaration, clock)
+        if math.isnan(frame.time_s) and values.get("time") not in (None, "") and report.unread_time is None:
+            report.unread_time = clean_text(str(values["time"]), 40)
+            report.warn(f"{report.unread_time!r} is no time between 2000 and 2100; times are {ACCEPTED_TIMES}")
         problem = _problem(frame)
         if problem is not None:
             report.leave_out(entry, *problem)
@@ -164,7 +171,7 @@ def _json_rows(name: str, data: bytes, declaration: PoseDeclaration) -> Iterator
         yield entry, {quantity: cells[place] for quantity, place in places.items()}
 
 
-def _frame_of(values: Mapping[str, object], declaration: PoseDeclaration) -> ListedFrame:
+def _frame_of(values: Mapping[str, object], declaration: PoseDeclaration, clock: LogClock) -> ListedFrame:
     def number(quantity: str) -> float:
         value = values.get(quantity)
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e9:
@@ -175,7 +182,7 @@ def _frame_of(values: Mapping[str, object], declaration: PoseDeclaration) -> Lis
     accuracy_m, heading_deg = number("accuracy"), number("heading")
     return ListedFrame(
         _last(name) if isinstance(name, str) else "",
-        declaration.times.read(values.get("time")),
+        clock.read(values.get("time")),
         number("lon"),
         number("lat"),
         heading_deg % 360.0,

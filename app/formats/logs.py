@@ -1,16 +1,20 @@
-"""Logs in general: the report about reading one, and its times as seconds since 1970-01-01 UTC."""
+"""Logs in general: the report about reading one, its times as seconds since 1970-01-01 UTC, and its datum."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 
 from pydantic import Field
 
-from app.inputs import Declaration, Number
+from app.errors import InvalidParameter, ReferenceSystemError
+from app.geodesy import place_position, reference_system
+from app.geodesy.systems import is_global
+from app.inputs import Declaration, Flag, Number
 
 # === The report about reading an uploaded log: entries, entries left out, warnings.
 
@@ -36,6 +40,7 @@ class LogReport:
     left_out: list[LeftOutEntry] = field(default_factory=list)  # the first ones
     left_out_count: int = 0
     reasons: dict[str, int] = field(default_factory=dict)  # entries left out, by kind
+    unread_time: str | None = None  # the first text that was expected to be a time and is none
     warnings: list[str] = field(default_factory=list)
 
     def leave_out(self, entry: int, kind: str, reason: str) -> None:
@@ -64,7 +69,18 @@ _LEAP_SECONDS = (
 """GPS times after which UTC is behind by one more second (IERS bulletin C, up to 2017; none since)."""
 _EARLIEST_S, _LATEST_S = 946_684_800.0, 4_102_444_800.0  # [s] the years 2000 to 2100
 _LEAP_SECOND = re.compile(r"(:\d\d):60(?=\D|$)")
+_LOCAL_DATE = re.compile(
+    r"(?:(?P<year>\d{4})(?P<s>[./])(?P<month>\d{1,2})(?P=s)(?P<day>\d{1,2})"
+    r"|(?P<first>\d{1,2})(?P<sign>[./-])(?P<second>\d{1,2})(?P=sign)(?P<last>\d{4}))[,.]?\s+"
+    r"(?P<h>\d{1,2}):(?P<m>\d\d)(?::(?P<sec>\d\d(?:[.,]\d{1,9})?))?(?:\s*(?P<half>[AP])\.?M\.?)?"
+    r"\s*(?P<zone>Z|[+-]\d\d:?\d\d)?\Z",
+    re.IGNORECASE,
+)
+"""A time as spreadsheets and browsers write it: 31.05.2026 08:00, 5/31/2026, 8:00:00 AM, 2026/05/31 08:00."""
+ACCEPTED_TIMES = "RFC 3339 such as 2026-06-01T08:00:00Z, 01.06.2026 08:00:00, or numbers since 1970"
+_COLUMN_HEAD = 20  # rows that show whether a column of times holds local dates
 _NUMBER = re.compile(r"[+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d{1,2})?\Z")
+_ROLLOVER_BEFORE_S, _ROLLOVER_AFTER_S = 366 * 86_400.0, 2 * 86_400.0  # [s] a track is uploaded at most a year later
 _MAX_TEXT = 64  # [character] longest time that is read
 NOWHEN = math.nan
 
@@ -105,6 +121,45 @@ class LogClock(Declaration):
         le=14 * 3600,
         description="Of times without a zone: local time less UTC, e.g. -18000 for UTC-5. [s]",
     )
+    day_first: Flag | None = Field(
+        None,
+        description="Whether 01/06/2026 is 1 June. Only needed if no date of the file shows it; 01.06.2026 always is.",
+    )
+
+    def of_column(self, texts: Iterable[str], field: str) -> LogClock:
+        """This clock, with the order of day and month that the dates of a column show.
+
+        Raises
+        ------
+        InvalidParameter
+            They do not show it, or contradict each other.
+        """
+        if self.day_first is not None:
+            return self
+        written = iter(texts)
+        head = [text for _row, text in zip(range(_COLUMN_HEAD), written, strict=False)]
+        if not any(_is_in_doubt(text) for text in head):
+            return self
+        unclear: str | None = None
+        orders: dict[bool, str] = {}
+        for text in (*head, *written):
+            found = _LOCAL_DATE.match(text.strip())
+            if found is None or found["year"] or found["sign"] == ".":
+                continue
+            first, second = int(found["first"]), int(found["second"])
+            if max(first, second) > 12:
+                orders.setdefault(first > 12, text)
+            elif first != second:
+                unclear = unclear or text
+        if len(orders) == 1 or (not orders and unclear is None):
+            return self.model_copy(update={"day_first": next(iter(orders), True)})
+        shown = " and ".join(repr(text.strip()[:_MAX_TEXT]) for text in orders.values()) or repr(unclear)
+        raise InvalidParameter(
+            f"the dates of the file do not show whether the day or the month comes first: {shown}",
+            field=field,
+            limit="true (day first) or false (month first)",
+            cure="declare day_first of the clock, or write times as 2026-06-01T08:00:00Z",
+        )
 
     def read(self, value: object) -> float:
         """Seconds since 1970-01-01 UTC; NaN where there is no time between 2000 and 2100. [s]"""
@@ -145,7 +200,47 @@ class LogClock(Declaration):
                 return at.replace(tzinfo=UTC).timestamp() - self.utc_offset_s + leap
             return at.timestamp() + leap
         except (ValueError, OverflowError):
+            return self._from_local_date(text)
+
+    def _from_local_date(self, text: str) -> float:
+        found = _LOCAL_DATE.match(text)
+        if found is None:
             return NOWHEN
+        if found["year"]:
+            year, month, day = int(found["year"]), int(found["month"]), int(found["day"])
+        else:
+            year, first, second = int(found["last"]), int(found["first"]), int(found["second"])
+            day_first = True if found["sign"] == "." or first == second else self.day_first
+            if day_first is None and max(first, second) > 12:
+                day_first = first > 12
+            if day_first is None:
+                return NOWHEN
+            day, month = (first, second) if day_first else (second, first)
+        hour = int(found["h"])
+        if found["half"]:
+            if not 1 <= hour <= 12:
+                return NOWHEN
+            hour = hour % 12 + (12 if found["half"] in "pP" else 0)
+        try:
+            at = datetime(year, month, day, hour, int(found["m"]), tzinfo=UTC) + timedelta(
+                seconds=float((found["sec"] or "0").replace(",", "."))
+            )
+        except (ValueError, OverflowError):
+            return NOWHEN
+        zone_s = _zone_s(found["zone"]) if found["zone"] else self.utc_offset_s
+        return at.timestamp() - zone_s
+
+
+def _is_in_doubt(text: str) -> bool:
+    """Whether a text is a date whose day and month could be exchanged."""
+    found = _LOCAL_DATE.match(text.strip()) if "/" in text or "-" in text else None
+    return found is not None and not found["year"] and found["sign"] != "."
+
+
+def _zone_s(zone: str) -> float:
+    if zone in "zZ":
+        return 0.0
+    return (1 if zone[0] == "+" else -1) * (3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:]))
 
 
 def utc_from_gps_s(gps_s: float) -> float:
@@ -153,6 +248,67 @@ def utc_from_gps_s(gps_s: float) -> float:
     return gps_s + GPS_EPOCH_S - sum(gps_s >= leap for leap in _LEAP_SECONDS)
 
 
+_WEEK_S = 7 * 86_400.0
+ROLLOVER_CURE = (
+    "receivers that missed a rollover of the GPS week counter are 1024 or 2048 weeks behind: declare clock.offset_s "
+    "619315200 or 1238630400 of the poses"
+)
+
+
+def describe_rollover(time_s: float, reference_s: float) -> str | None:
+    """A warning, if a track is dated so as receivers do that missed a rollover of the GPS week counter; else None.
+
+    Parameters
+    ----------
+    time_s, reference_s : float
+        When the track began by its own times, and when it was uploaded or captured. The number of the week has 10 bits
+        (IS-GPS-200, 20.3.3.3.1.1), so that such receivers are 1024 or 2048 weeks behind. [s]
+    """
+    for weeks in (1024, 2048):
+        true_s = time_s + weeks * _WEEK_S
+        if reference_s - _ROLLOVER_BEFORE_S <= true_s <= reference_s + _ROLLOVER_AFTER_S:
+            dated, true = (datetime.fromtimestamp(at, UTC).date() for at in (time_s, true_s))
+            return (
+                f"the track is dated {dated}, and with {weeks} weeks added {true}: its receiver seems to have missed a "
+                f"rollover of the GPS week counter; declare clock.offset_s {weeks * _WEEK_S:.0f} of the poses, or "
+                "update the receiver's firmware"
+            )
+    return None
+
+
 def has_zone(text: str) -> bool:
     """Whether a text in RFC 3339 names its zone."""
     return re.search(r"(?:[zZ]|[+-]\d\d:?\d\d)\s*\Z", text) is not None
+
+
+# === The datum of positions in logs: they must be in WGS 84 / ITRF.
+
+
+_WGS84_NAME = re.compile(r"(WGS[ _-]?(19)?84|ITRF|IGS|W84)", re.IGNORECASE)
+_EPSG_NUMBER = re.compile(r"\d{4,6}\Z", re.ASCII)
+
+
+def check_datum(crs: str, lon_deg: float = 0.0, lat_deg: float = 0.0) -> None:
+    """Refuse a coordinate reference system of a track that is not WGS 84 / ITRF.
+
+    Raises
+    ------
+    ReferenceSystemError
+    """
+    text = crs.strip()
+    if not text or _WGS84_NAME.match(text):
+        return
+    name = f"EPSG:{text}" if _EPSG_NUMBER.match(text) else text
+    refusal = ReferenceSystemError(
+        f"positions are in {text[:60]!r}, which is not WGS 84 / ITRF",
+        field="poses.crs",
+        limit="WGS 84",
+        cure="transform the track to WGS 84 (EPSG:4326) with a stated accuracy before it is sent",
+    )
+    try:
+        place_position(lon_deg, lat_deg, crs=name)
+        known = is_global(reference_system(name))
+    except InvalidParameter as error:
+        raise refusal from error
+    if not known:
+        raise refusal

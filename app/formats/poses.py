@@ -9,9 +9,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime, time, timedelta
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from operator import xor
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,45 +20,14 @@ from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter, ReferenceSystemError, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, list_accepted
-from app.formats.logs import LogClock, LogReport, has_zone
+from app.formats.logs import ACCEPTED_TIMES, ROLLOVER_CURE, LogClock, LogReport, check_datum, has_zone
 from app.formats.text import clean_text, numbered_lines, read_number
-from app.geodesy import place_position, reference_system
-from app.geodesy.systems import is_global
 from app.inputs import Declaration, Name, Number
-from app.sensors.pose_track import PoseTrack
+from app.sensors.pose_track import FASTEST_M_S, PoseTrack, find_jumps
 from app.values import Floats
 
 if TYPE_CHECKING:
     import gpxpy.gpx
-
-
-# === The datum of a track: positions must be in WGS 84 / ITRF.
-
-
-_WGS84_NAME = re.compile(r"(WGS[ _-]?(19)?84|ITRF|IGS|W84)", re.IGNORECASE)
-_EPSG_NUMBER = re.compile(r"\d{4,6}\Z", re.ASCII)
-_CURE_DATUM = "transform the track to WGS 84 (EPSG:4326) with a stated accuracy before it is sent"
-
-
-def check_datum(crs: str, lon_deg: float = 0.0, lat_deg: float = 0.0) -> None:
-    """Refuse a coordinate reference system that is not WGS 84 / ITRF.
-
-    Raises
-    ------
-    ReferenceSystemError
-    """
-    text = crs.strip()
-    if not text or _WGS84_NAME.match(text):
-        return
-    name = f"EPSG:{text}" if _EPSG_NUMBER.match(text) else text
-    with_cure = f"positions are in {text[:60]!r}, which is not WGS 84 / ITRF"
-    try:
-        place_position(lon_deg, lat_deg, crs=name)
-        known = is_global(reference_system(name))
-    except InvalidParameter as error:
-        raise ReferenceSystemError(with_cure, field="poses.crs", limit="WGS 84", cure=_CURE_DATUM) from error
-    if not known:
-        raise ReferenceSystemError(with_cure, field="poses.crs", limit="WGS 84", cure=_CURE_DATUM)
 
 
 # === What is declared of a vehicle's track, and what reading one may cost.
@@ -67,7 +37,7 @@ FIELD = "poses"
 ALIASES: dict[str, tuple[str, ...]] = {
     "time": (
         "time", "timestamp", "time_s", "t_s", "utc", "utc_time", "time_utc", "datetime", "date_time", "unix_time",
-        "timestamp_ms", "time_ms", "t",
+        "timestamp_ms", "time_ms", "t", "zeit", "zeitstempel",
     ),
     "lon": ("longitude", "lon", "lng", "long", "lon_deg", "longitude_deg", "longitude_degrees"),
     "lat": ("latitude", "lat", "lat_deg", "latitude_deg", "latitude_degrees"),
@@ -143,12 +113,6 @@ def too_many_points(name: str, limits: PoseLimits) -> UploadTooLarge:
 # === Points of a track in the order of the file, and the track that they form.
 
 
-FASTEST_M_S = 150.0
-"""A point that can only be reached faster than this, from both sides, is an outlier. [m/s] 540 km/h."""
-_SLACK_M = 30.0  # [m] jump of a receiver that is no outlier
-_M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
-
-
 @dataclass(frozen=True, slots=True)
 class PosePoint:
     """One position."""
@@ -221,21 +185,6 @@ def _check_swapped(name: str, lon_deg: Floats, lat_deg: Floats) -> None:
         )
 
 
-def find_jumps(table: Floats) -> npt.NDArray[np.bool_]:
-    """Which rows (time [s], longitude, latitude [deg], ...) can only be reached too fast, from both sides."""
-    if len(table) < 3:
-        return np.zeros(len(table), bool)
-    east = (np.diff(table[:, 1]) + 180) % 360 - 180
-    step_m = _M_PER_DEG * np.hypot(east * np.cos(np.radians(table[:-1, 2])), np.diff(table[:, 2]))
-    fast = step_m > FASTEST_M_S * np.diff(table[:, 0]) + _SLACK_M
-    across = _M_PER_DEG * np.hypot(
-        ((table[2:, 1] - table[:-2, 1] + 180) % 360 - 180) * np.cos(np.radians(table[:-2, 2])),
-        table[2:, 2] - table[:-2, 2],
-    )
-    direct = across <= FASTEST_M_S * (table[2:, 0] - table[:-2, 0]) + _SLACK_M
-    return np.concatenate(([False], fast[:-1] & fast[1:] & direct, [False]))
-
-
 # === Tracks as delimited text with a header.
 
 
@@ -265,15 +214,22 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
         )
     datums: set[str] = set()
     zoned = True
+    clock = declaration.times.of_column(
+        (cells[places["time"]] for cells in log.rows() if cells is not None), "poses.clock.day_first"
+    )
     for entry, cells in enumerate(log.rows()):
         report.entries += 1
         if cells is None:
             report.leave_out(entry, "malformed", log.bad_row())
             continue
         try:
-            point = _point_of(entry, cells, places, declaration.times, log.dialect.decimal)
+            point = _point_of(entry, cells, places, clock, log.dialect.decimal)
         except (ValueError, OverflowError):
             report.leave_out(entry, "malformed", "the row holds text where numbers are expected")
+            continue
+        if math.isnan(point.time_s) and cells[places["time"]].strip():
+            written = clean_text(cells[places["time"]], 40)
+            report.leave_out(entry, "no-time", f"{written!r} is no time between 2000 and 2100 ({ACCEPTED_TIMES})")
             continue
         if "crs" in places and cells[places["crs"]] not in datums:
             if not math.isnan(point.lon_deg):
@@ -299,6 +255,7 @@ def _point_of(entry: int, cells: list[str], places: Mapping[str, int], clock: Lo
 
 
 _HEAD_CHARS = 1 << 14  # [character] in which the root element stands
+_GPX_LEAP_SECOND = re.compile(r"(\d{4}-\d\d-\d\dT(?:[01]\d|2[0-3]):[0-5]\d):60((?:\.\d+)?(?:Z|[+-]\d\d:?\d\d)?\s*<)")
 
 
 def is_gpx(text: str) -> bool:
@@ -333,6 +290,10 @@ def read_gpx(source: PoseSource) -> Iterator[PosePoint]:
     import gpxpy.gpx
 
     try:
+        if ":60" in text:  # leap seconds, which `datetime` does not have
+            text = _GPX_LEAP_SECOND.sub(
+                lambda found: f"{(datetime.fromisoformat(found[1]) + timedelta(minutes=1)).isoformat()}{found[2]}", text
+            )
         gpx = gpxpy.parse(re.sub(r"\A\s*<\?xml[^>]*\?>", "", text.lstrip("\ufeff")))
     except (gpxpy.gpx.GPXException, ValueError, TypeError, LookupError, RecursionError) as error:
         raise UnreadableUpload(
@@ -370,10 +331,15 @@ def _course(point: gpxpy.gpx.GPXTrackPoint) -> float:
 
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),([^*$\r\n]{0,200})(?:\*([0-9A-Fa-f]{2}))?")
 _POSITIONS = ("RMC", "GGA", "GNS", "GLL")
-_READ = (*_POSITIONS, "VTG", "HDT", "THS", "GST", "ZDA", "DTM")
+_UNTIMED = ("HDT", "THS", "VTG")
+_READ = (*_POSITIONS, *_UNTIMED, "GST", "ZDA", "DTM")
 _MIN_SPEED_KN = 2.0
 """Below this speed the course over ground is noise, not the heading. [kn]"""
-_HALF_DAY = timedelta(hours=12)
+_HALF_DAY_S = 43_200.0
+_TURNED_DEG = 5.0  # [deg] a heading that changes more from one sentence to the next depends on its epoch
+_CLOCK_TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.\d*)?\Z", re.ASCII)
+_TIME_FIELDS = {"GLL": 5}  # field of a sentence that holds its time, where it is not the first
+_MODE_FIELDS = {"RMC": 12, "GGA": 6, "GNS": 6, "GLL": 7, "VTG": 9}  # of the mode of position or motion
 
 
 @dataclass(slots=True)
@@ -381,7 +347,7 @@ class _Epoch:
     """Values of the sentences of one time."""
 
     entry: int
-    at: time
+    second_s: float  # [s] after midnight; 86,400 and more in a leap second
     day: date | None = None
     lon_deg: float = math.nan
     lat_deg: float = math.nan
@@ -391,18 +357,69 @@ class _Epoch:
     void: bool = False
 
 
+class _Untimed(NamedTuple):
+    """A heading or a course, whose sentence has no time."""
+
+    kind: str
+    quantity: str  # of the epoch
+    value_deg: float
+    began: int  # how many epochs began before it
+
+
 @dataclass(slots=True)
 class _Reading:
     """The epochs read so far."""
 
     report: LogReport
     epochs: list[_Epoch] = field(default_factory=list)
+    waiting: list[_Untimed] = field(default_factory=list)  # since the last sentence that has a time
+    between: list[_Untimed] = field(default_factory=list)  # after the last sentence of one epoch, before the next one
+    inside: set[tuple[str, int]] = field(default_factory=set)  # kinds that stand within an epoch, and which epoch
 
-    def epoch_at(self, entry: int, at: time) -> _Epoch:
+    def take_untimed(self, kind: str, quantity: str, value_deg: float) -> None:
+        """Keep a value until it is known whether its epoch goes on."""
+        self.waiting.append(_Untimed(kind, quantity, value_deg, len(self.epochs)))
+
+    def epoch_at(self, entry: int, second_s: float) -> _Epoch:
         """That of a time; sentences of one time come one after the other."""
-        if not self.epochs or self.epochs[-1].at != at:
-            self.epochs.append(_Epoch(entry, at))
+        if self.epochs and self.epochs[-1].second_s == second_s:
+            for one in self.waiting:
+                self._place(one, len(self.epochs) - 1)
+                self.inside.add((one.kind, one.began - 1))
+        else:
+            self.between += self.waiting
+            self.epochs.append(_Epoch(entry, second_s))
+        self.waiting.clear()
         return self.epochs[-1]
+
+    def _place(self, one: _Untimed, place: int) -> None:
+        if not math.isnan(one.value_deg):
+            setattr(self.epochs[place], one.quantity, one.value_deg)
+
+    def place_between(self, *, is_cut: bool) -> None:
+        """Put what stands between two epochs into one of them: the order is the receiver's, the same in all epochs.
+
+        A log that begins with such a sentence has it at the beginning of its epochs, one that ends with it at their
+        end. In a log that was cut within an epoch both or neither may hold; then the end is assumed.
+        """
+        self.between += self.waiting
+        for kind in _UNTIMED:
+            found = [one for one in self.between if one.kind == kind]
+            if not found or len(found) < sum(inside == kind for inside, _place in self.inside):
+                continue  # within epochs as a rule: around these a sentence was lost
+            at_start = found[0].began == 0 and not is_cut
+            at_end = found[-1].began == len(self.epochs)
+            begins = at_start and not at_end
+            steps_deg = (np.diff([one.value_deg for one in found]) + 180) % 360 - 180
+            if at_start == at_end and (np.abs(steps_deg) > _TURNED_DEG).any():
+                self.report.warn(
+                    f"{kind} sentences have no time, and the log does not show whether an epoch begins or ends with "
+                    "them: they were taken to be at its end, so that headings may be one epoch early"
+                )
+            for one in found if begins else reversed(found):  # of several, the one beside the epoch's other sentences
+                place = one.began if begins else one.began - 1
+                if 0 <= place < len(self.epochs) and (kind, place) not in self.inside:
+                    self._place(one, place)
 
 
 def looks_like_nmea(text: str) -> bool:
@@ -426,17 +443,21 @@ def read_nmea(source: PoseSource) -> Iterator[PosePoint]:
     reading = _Reading(report)
     sentences = list(_find_sentences(text, report))
     chosen = _choose_talkers(sentences)
-    rmc_times = {
-        _field(sentence, 1)
+    rmc_times_s = {
+        _second_of_day(kind, sentence)
         for _entry, talker, kind, sentence in sentences
         if kind == "RMC" and chosen["RMC"] == talker and _field(sentence, 2) == "A"
     }
     for entry, talker, kind, sentence in sentences:
         if chosen.get(kind, talker) != talker:
             continue
+        if _is_estimated(kind, sentence):
+            report.warn("positions were estimated by dead reckoning in places")
+        second_s = _second_of_day(kind, sentence)
         if (
-            kind in _POSITIONS[1:] and _field(sentence, 5 if kind == "GLL" else 1) in rmc_times
+            kind in _POSITIONS[1:] and second_s in rmc_times_s and not math.isnan(second_s)
         ):  # RMC has the same position, and the date
+            reading.epoch_at(entry, second_s)
             continue
         try:
             parsed = pynmeagps.NMEAReader.parse(sentence, validate=pynmeagps.VALNONE)
@@ -446,9 +467,11 @@ def read_nmea(source: PoseSource) -> Iterator[PosePoint]:
         if parsed is None:
             continue
         try:
-            _take(entry, kind, parsed, reading)
+            _take(entry, kind, second_s, parsed, reading)
         except AttributeError:  # a cut sentence has no such field
             report.leave_out(entry, "malformed", f"a {kind} sentence with fields missing")
+    first_line = text.lstrip("\ufeff \t\r\n").split("\n", 1)[0]
+    reading.place_between(is_cut=_SENTENCE.search(first_line[:1024]) is None)
     yield from _points(reading.epochs, declaration.times, declaration.date, report)
 
 
@@ -476,11 +499,24 @@ def _field(sentence: str, place: int) -> str:
     return fields[place] if place < len(fields) else ""
 
 
+def _second_of_day(kind: str, sentence: str) -> float:
+    """Time of a sentence after midnight; NaN if it has none. [s]"""
+    written = _field(sentence, _TIME_FIELDS.get(kind, 1)).split("*")[0]
+    if not _CLOCK_TIME.match(written):
+        return math.nan
+    return 3600.0 * int(written[:2]) + 60.0 * int(written[2:4]) + float(written[4:])
+
+
+def _is_estimated(kind: str, sentence: str) -> bool:
+    """Whether a receiver reports that it estimates its position or motion, by dead reckoning."""
+    mode = _field(sentence, _MODE_FIELDS[kind]).split("*")[0] if kind in _MODE_FIELDS else ""
+    if kind == "GGA":
+        return mode == "6"
+    return "E" in mode and not mode.strip("EN")  # GNS has a mode of each satellite system
+
+
 def _checksum(content: str) -> int:
-    value = 0
-    for byte in content.encode("ascii", "replace"):
-        value ^= byte
-    return value
+    return reduce(xor, content.encode("ascii", "replace"), 0)
 
 
 def _choose_talkers(sentences: Iterable[tuple[int, str, str, str]]) -> dict[str, str]:
@@ -492,27 +528,29 @@ def _choose_talkers(sentences: Iterable[tuple[int, str, str, str]]) -> dict[str,
     return {kind: "GN" if "GN" in found else found.most_common(1)[0][0] for kind, found in counts.items()}
 
 
-def _take(entry: int, kind: str, sentence: Any, reading: _Reading) -> None:
+def _take(entry: int, kind: str, second_s: float, sentence: Any, reading: _Reading) -> None:
     if kind == "DTM":
         _check_datum(entry, sentence)
-    elif kind in ("HDT", "THS") and reading.epochs:
+    elif kind in ("HDT", "THS"):
         heading = getattr(sentence, "headingT", None) if kind == "HDT" else _heading_of_ths(sentence)
-        reading.epochs[-1].heading_deg = _figure(heading)
-    elif kind == "VTG" and reading.epochs:
-        if _figure(sentence.sogn) >= _MIN_SPEED_KN:
-            reading.epochs[-1].course_deg = _figure(sentence.cogt)
-    elif kind == "ZDA" and isinstance(sentence.time, time):
-        epoch = reading.epoch_at(entry, sentence.time)
+        reading.take_untimed(kind, "heading_deg", _figure(heading))
+    elif kind == "VTG":
+        moves = _figure(sentence.sogn) >= _MIN_SPEED_KN
+        reading.take_untimed(kind, "course_deg", _figure(sentence.cogt) if moves else math.nan)
+    elif math.isnan(second_s):
+        return
+    elif kind == "ZDA":
+        epoch = reading.epoch_at(entry, second_s)
         try:
             epoch.day = date(int(sentence.year), int(sentence.month), int(sentence.day))
         except (ValueError, TypeError, OverflowError):
             reading.report.leave_out(entry, "malformed", "a ZDA sentence without a date")
-    elif isinstance(getattr(sentence, "time", None), time):
-        _take_position(entry, kind, sentence, reading)
+    else:
+        _take_position(entry, kind, second_s, sentence, reading)
 
 
-def _take_position(entry: int, kind: str, sentence: Any, reading: _Reading) -> None:
-    epoch = reading.epoch_at(entry, sentence.time)
+def _take_position(entry: int, kind: str, second_s: float, sentence: Any, reading: _Reading) -> None:
+    epoch = reading.epoch_at(entry, second_s)
     if kind == "GST":
         north_m, east_m = _figure(sentence.stdLat), _figure(sentence.stdLong)
         epoch.accuracy_m = math.sqrt((north_m**2 + east_m**2) / 2)
@@ -527,8 +565,6 @@ def _take_position(entry: int, kind: str, sentence: Any, reading: _Reading) -> N
         epoch.void = True
     elif not (math.isnan(lon_deg) or math.isnan(lat_deg)):
         epoch.lon_deg, epoch.lat_deg = lon_deg, lat_deg
-    if kind == "GGA" and sentence.quality == 6:
-        reading.report.warn("positions were estimated by dead reckoning in places (GGA quality 6)")
 
 
 def _has_fix(kind: str, sentence: Any) -> bool:
@@ -570,20 +606,25 @@ def _points(epochs: list[_Epoch], clock: LogClock, day: date | None, report: Log
             "no sentence has a date (RMC or ZDA)", field="poses.date", cure="declare the UTC date of the first position"
         )
     current = _day_of_first(epochs, first) if first is not None else day
-    last: time | None = None
+    last_s = midnight_s = math.nan
+    dated: date | None = None
     for epoch in epochs:
         if epoch.day is not None:
             current = epoch.day
-        elif last is not None and current is not None and _since_midnight(last) - _since_midnight(epoch.at) > _HALF_DAY:
+        elif current is not None and last_s - epoch.second_s > _HALF_DAY_S:
             current += timedelta(days=1)  # past midnight, and no sentence with a date yet
-        last = epoch.at
+        last_s = epoch.second_s
         if epoch.void or math.isnan(epoch.lon_deg):
             if epoch.void:
                 report.leave_out(epoch.entry, "no-fix", "the receiver reports that it has no position")
             continue
-        assert current is not None
+        if current is not None and current != dated:
+            dated, midnight_s = current, clock.read(datetime.combine(current, time(), UTC).isoformat())
+        if math.isnan(midnight_s):
+            report.leave_out(epoch.entry, "no-time", f"{current} is not between 2000 and 2100; {ROLLOVER_CURE}")
+            continue
         heading_deg = epoch.course_deg if math.isnan(epoch.heading_deg) else epoch.heading_deg
-        at_s = clock.read(datetime.combine(current, epoch.at, UTC).isoformat())
+        at_s = midnight_s + epoch.second_s
         yield PosePoint(epoch.entry, at_s, epoch.lon_deg, epoch.lat_deg, heading_deg, epoch.accuracy_m)
 
 
@@ -591,13 +632,9 @@ def _day_of_first(epochs: list[_Epoch], dated: int) -> date | None:
     """The date of the first epoch, counted back from the first epoch that has one."""
     day = epochs[dated].day
     for later, earlier in zip(reversed(epochs[1 : dated + 1]), reversed(epochs[:dated]), strict=True):
-        if day is not None and _since_midnight(earlier.at) - _since_midnight(later.at) > _HALF_DAY:
+        if day is not None and earlier.second_s - later.second_s > _HALF_DAY_S:
             day -= timedelta(days=1)
     return day
-
-
-def _since_midnight(at: time) -> timedelta:
-    return timedelta(hours=at.hour, minutes=at.minute, seconds=at.second, microseconds=at.microsecond)
 
 
 # === Formats of tracks: how each is detected and read.
@@ -699,21 +736,15 @@ def read_poses(
 
 def _read_any(source: PoseSource) -> Iterable[PosePoint]:
     sample = source.sample
-    if not sample.is_text:
-        raise _unsupported(sample.name)
+    found = detect_format(sample, POSE_FORMATS) if sample.is_text else None
+    if found is None:
+        raise UnsupportedUpload(
+            f"{sample.name} has no format that tracks are read in",
+            field=FIELD,
+            limit=EXPECTED,
+            cure="export it in one of these formats",
+        )
     if sample.decoded[1] is not None:
         source.report.warn(sample.decoded[1])
-    found = detect_format(sample, POSE_FORMATS)
-    if found is None:
-        raise _unsupported(sample.name)
     source.report.format = found.name
     return found.read(source)
-
-
-def _unsupported(name: str) -> UnsupportedUpload:
-    return UnsupportedUpload(
-        f"{name} has no format that tracks are read in",
-        field=FIELD,
-        limit=EXPECTED,
-        cure="export it in one of these formats",
-    )

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from app.errors import InvalidParameter
 from app.geodesy.frames import metres_per_radian
@@ -23,6 +24,10 @@ WANDER_SD_M, WANDER_LENGTH_M = 0.25, 30.0  # [m, m] of a driver along the lane
 RECEIVER_OPTIMISM = 1.5  # true error of a receiver over the accuracy that it reports
 SLOW_SHARE = 0.3  # of a receiver's error that changes along the track like wander
 MAX_SPEED_M_S = 70.0  # [m/s] a faster step is a gap in the track; 252 km/h
+FASTEST_M_S = 150.0
+"""A point that can only be reached faster than this, from both sides, is an outlier. [m/s] 540 km/h."""
+_SLACK_M = 30.0  # [m] jump of a receiver that is no outlier
+_M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +120,21 @@ class PoseTrack:
                 total_m += leg_m
             at = k
         return total_m
+
+
+def find_jumps(table: Floats) -> npt.NDArray[np.bool_]:
+    """Which rows (time [s], longitude, latitude [deg], ...) can only be reached too fast, from both sides."""
+    if len(table) < 3:
+        return np.zeros(len(table), bool)
+    east = (np.diff(table[:, 1]) + 180) % 360 - 180
+    step_m = _M_PER_DEG * np.hypot(east * np.cos(np.radians(table[:-1, 2])), np.diff(table[:, 2]))
+    fast = step_m > FASTEST_M_S * np.diff(table[:, 0]) + _SLACK_M
+    across = _M_PER_DEG * np.hypot(
+        ((table[2:, 1] - table[:-2, 1] + 180) % 360 - 180) * np.cos(np.radians(table[:-2, 2])),
+        table[2:, 2] - table[:-2, 2],
+    )
+    direct = across <= FASTEST_M_S * (table[2:, 0] - table[:-2, 0]) + _SLACK_M
+    return np.concatenate(([False], fast[:-1] & fast[1:] & direct, [False]))
 
 
 # === Packets as a receiver in a vehicle received them.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from datetime import UTC, datetime
 
 import pytest
 
@@ -32,6 +33,16 @@ def test_json_and_the_declared_clock() -> None:
     for document in (rows, {"frames": rows}):
         listed = read_frame_list("frames.json", json.dumps(document).encode(), declaration).frames
         assert (listed["1.jpg"].time_s, listed["1.jpg"].accuracy_m) == (1777883401.5, 3.0)
+
+
+def test_times_as_spreadsheets_write_them() -> None:
+    for at, shows in (("01.06.2026 08:00:00", ""), ("6/1/2026 8:00 AM", "b.jpg;6/13/2026 8:00 AM\n")):
+        read = read_frame_list("frames.csv", f"file;time\na.jpg;{at}\n{shows}".encode())
+        assert datetime.fromtimestamp(read.frames["a.jpg"].time_s, UTC) == datetime(2026, 6, 1, 8, tzinfo=UTC)
+    with pytest.raises(InvalidParameter, match="day or the month"):
+        read_frame_list("frames.csv", b"file;time\na.jpg;6/1/2026 8:00 AM\n")
+    read = read_frame_list("frames.csv", b"file;time\na.jpg;Montag\n")
+    assert "'Montag'" in read.report.warnings[0]
 
 
 def test_rows_that_are_left_out_are_counted() -> None:

@@ -18,11 +18,12 @@ from app.formats.packets.rows import (
     BrokenEntry,
     PacketSource,
     PayloadText,
+    note_unread_time,
     packet_from_values,
     payload_text,
     read_payload,
 )
-from app.formats.text import MAX_LINE, clean_text, match_columns, numbered_lines
+from app.formats.text import MAX_LINE, clean_text, match_columns, numbered_lines, read_number
 from app.sensors.pose_track import ReceivedPacket
 
 # === Entries of packet logs in JSON: a document, an array, lines, or documents one after the other.
@@ -63,7 +64,7 @@ def read_records(name: str, text: str, document_chars: int) -> Iterator[Record]:
                 limit=f"{document_chars} characters in one document",
                 cure="write one JSON object a line",
             )
-    elif "\n" not in text.rstrip():
+    elif "\n" not in text.rstrip() and text[:1] in ("{", "["):
         return _from_document(_parse(text))
     return _read_lines(text)
 
@@ -156,10 +157,13 @@ _DECODER = json.JSONDecoder(object_pairs_hook=_object_of)
 """NaN and infinity become floats that are refused where a number is read."""
 
 
-# === Packets from uplink events of LoRaWAN network servers: ChirpStack v4 and The Things Stack v3.
+# === Packets from uplink events of LoRaWAN network servers, and from gateways.
 #
-# Both write proto3 JSON: what is zero, false or empty is left out. Sources: ChirpStack's api/proto/integration and
-# api/proto/gw (v4); The Things Stack's "Data Formats" and "Storage Integration" pages (v3).
+# ChirpStack and The Things Stack write proto3 JSON: what is zero, false or empty is left out. Sources: ChirpStack's
+# api/proto/integration and api/proto/gw (v4); The Things Stack's "Data Formats" and "Storage Integration" pages (v3);
+# The Things Network's "MQTT Data API" (v2); Loriot's "Application API: uplink data message"; Helium Console's "JSON
+# message schema"; AWS IoT Core for LoRaWAN's "Working with uplink messages"; Actility's "LRC-AS tunnel interface";
+# Semtech's packet_forwarder/PROTOCOL.TXT.
 
 
 _LEVELS = 5  # envelopes around an event
@@ -172,10 +176,16 @@ _OTHER_EVENTS = (
 
 
 class UplinkKind(StrEnum):
-    """The network server that an event is from."""
+    """The network server, or the program of a gateway, that an event is from."""
 
     CHIRPSTACK = "chirpstack-v4"
     THINGS_STACK = "things-stack-v3"
+    THINGS_NETWORK = "things-network-v2"
+    LORIOT = "loriot"
+    HELIUM = "helium"
+    AWS = "aws-iot-lorawan"
+    ACTILITY = "actility-thingpark"
+    SEMTECH = "semtech-udp"
 
 
 def open_envelope(record: Mapping[str, Any]) -> tuple[Mapping[str, object], str | None]:
@@ -228,6 +238,18 @@ def find_kind(record: Mapping[str, object]) -> UplinkKind | None:
         return UplinkKind.CHIRPSTACK
     if "devEUI" in record and "applicationID" in record:
         return UplinkKind.CHIRPSTACK
+    if isinstance(record.get("metadata"), dict) and "dev_id" in record and "app_id" in record:
+        return UplinkKind.THINGS_NETWORK
+    if isinstance(record.get("cmd"), str) and "EUI" in record:
+        return UplinkKind.LORIOT
+    if isinstance(record.get("hotspots"), list):
+        return UplinkKind.HELIUM
+    if isinstance(record.get("WirelessMetadata"), dict):
+        return UplinkKind.AWS
+    if any(name.startswith("DevEUI_") and isinstance(record[name], dict) for name in islice(record, 4)):
+        return UplinkKind.ACTILITY
+    if "tmst" in record and "datr" in record and "data" in record:
+        return UplinkKind.SEMTECH
     return None
 
 
@@ -239,9 +261,7 @@ def packet_from_uplink(entry: int, kind: UplinkKind, record: Mapping[str, object
     BrokenEntry
         It is another kind of event, or has no payload that can be read.
     """
-    if kind is UplinkKind.CHIRPSTACK:
-        return _from_chirpstack(entry, record, clock)
-    return _from_things_stack(entry, record, clock)
+    return _READERS[kind](entry, record, clock)
 
 
 # --- ChirpStack v4 ------------------------------------------------------------------------------------------------
@@ -257,9 +277,7 @@ def _from_chirpstack(entry: int, record: Mapping[str, object], clock: LogClock) 
         raise BrokenEntry(
             "encrypted", "the payload is still encrypted: ChirpStack has no session key (joinServerContext)"
         )
-    payload = read_payload(record.get("data"), PayloadText.BASE64)
-    if payload is None:
-        raise BrokenEntry("no-payload", "an uplink without a payload")
+    payload = _payload_of(record.get("data"), PayloadText.BASE64)
     best = _best(receptions)
     device = record.get("deviceInfo")
     times = (record.get("time"), best.get("gwTime"), best.get("nsTime"))
@@ -296,9 +314,7 @@ def _from_things_stack(entry: int, record: Mapping[str, object], clock: LogClock
         raise BrokenEntry("not-uplink", f"an event of The Things Stack that is no uplink: {other}")
     if record.get("simulated"):
         raise BrokenEntry("simulated", "a simulated uplink: nothing was received")
-    payload = read_payload(uplink.get("frm_payload"), PayloadText.BASE64)
-    if payload is None:
-        raise BrokenEntry("no-payload", "an uplink without a payload")
+    payload = _payload_of(uplink.get("frm_payload"), PayloadText.BASE64)
     best = _best(_objects(uplink.get("rx_metadata")))
     settings = uplink.get("settings")
     times = (
@@ -322,16 +338,148 @@ def _from_things_stack(entry: int, record: Mapping[str, object], clock: LogClock
     )
 
 
-# --- both ---------------------------------------------------------------------------------------------------------
+# --- others -------------------------------------------------------------------------------------------------------
+
+
+def _from_things_network(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
+    metadata = _mapping(record.get("metadata"))
+    best = _best(_objects(metadata.get("gateways")))
+    return ReceivedPacket(
+        entry,
+        _first_time((metadata.get("time"), best.get("time")), clock),
+        _payload_of(record.get("payload_raw"), PayloadText.BASE64),
+        rssi_dbm=_signal(best.get("rssi"), math.nan),
+        snr_db=_signal(best.get("snr"), math.nan),
+        device=clean_text(record.get("hardware_serial")) or clean_text(record.get("dev_id")),
+    )
+
+
+def _from_loriot(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
+    if record["cmd"] not in ("rx", "gw"):
+        raise BrokenEntry("not-uplink", f"a message of Loriot that is no uplink: {clean_text(record['cmd'], 40)}")
+    if not record.get("data") and record.get("encdata"):
+        raise BrokenEntry("encrypted", "the payload is still encrypted: Loriot has no application key (encdata)")
+    best = _best(_objects(record.get("gws"))) or record
+    device, count = clean_text(record.get("EUI")), clean_text(record.get("fcnt"))
+    return ReceivedPacket(
+        entry,
+        _unix_time(record.get("ts"), clock),
+        _payload_of(record.get("data"), PayloadText.HEX),
+        rssi_dbm=_signal(best.get("rssi"), math.nan),
+        snr_db=_signal(best.get("snr"), math.nan),
+        device=device,
+        # the same uplink comes as rx, and as gw with its gateways
+        event=f"{device}/{count}/{clean_text(record.get('ts'))}",
+    )
+
+
+def _from_helium(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
+    if record.get("type", "uplink") != "uplink":
+        raise BrokenEntry("not-uplink", f"an event of Helium that is no uplink: {clean_text(record['type'], 40)}")
+    best = _best(_objects(record.get("hotspots")))
+    return ReceivedPacket(
+        entry,
+        _unix_time(record.get("reported_at", best.get("reported_at")), clock),
+        _payload_of(record.get("payload"), PayloadText.BASE64),
+        rssi_dbm=_signal(best.get("rssi"), math.nan),
+        snr_db=_signal(best.get("snr"), math.nan),
+        device=clean_text(record.get("dev_eui")),
+        event=clean_text(record.get("uuid")),
+    )
+
+
+def _from_aws(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
+    lorawan = _mapping(_mapping(record["WirelessMetadata"]).get("LoRaWAN"))
+    if not lorawan:
+        raise BrokenEntry("not-uplink", "an event of AWS IoT Wireless that is no uplink of LoRaWAN")
+    best = _best(_objects(lorawan.get("Gateways")), "Rssi")
+    return ReceivedPacket(
+        entry,
+        _first_time((lorawan.get("Timestamp"),), clock),
+        _payload_of(record.get("PayloadData"), PayloadText.BASE64),
+        rssi_dbm=_signal(best.get("Rssi"), math.nan),
+        snr_db=_signal(best.get("Snr"), math.nan),
+        device=clean_text(lorawan.get("DevEui")),
+    )
+
+
+def _from_actility(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
+    uplink = _mapping(record.get("DevEUI_uplink"))
+    if not uplink:
+        other = clean_text(next(name for name in record if name.startswith("DevEUI_")), 40)
+        raise BrokenEntry("not-uplink", f"a report of Actility ThingPark that is no uplink: {other}")
+    if str(uplink.get("payload_encryption", 0)) == "1":
+        raise BrokenEntry("encrypted", "the payload is still encrypted: ThingPark has no key (payload_encryption)")
+    return ReceivedPacket(
+        entry,
+        _first_time((uplink.get("Time"),), clock),
+        _payload_of(uplink.get("payload_hex"), PayloadText.HEX),
+        rssi_dbm=_signal(uplink.get("LrrRSSI"), math.nan),  # of the gateway that received it best
+        snr_db=_signal(uplink.get("LrrSNR"), math.nan),
+        device=clean_text(uplink.get("DevEUI")),
+    )
+
+
+def _from_semtech(entry: int, record: Mapping[str, object], clock: LogClock) -> ReceivedPacket:
+    if record.get("stat") == -1:
+        raise BrokenEntry("crc", "the gateway received the packet with a wrong checksum (stat -1)")
+    payload = _payload_of(record.get("data"), PayloadText.BASE64)
+    if payload[0] >> 5 in _LORAWAN_UPLINKS and payload[0] & 0x1F == 0 and len(payload) >= _LORAWAN_BYTES:
+        raise BrokenEntry(
+            "encrypted", "a LoRaWAN frame as the gateway received it: log the uplinks of the network server instead"
+        )
+    received_at_s = _first_time((record.get("time"),), clock)
+    gps_ms = record.get("tmms")
+    if math.isnan(received_at_s) and isinstance(gps_ms, int):
+        received_at_s = LogClock(scale=TimeScale.GPS_MS, offset_s=clock.offset_s).read(gps_ms)
+    return ReceivedPacket(
+        entry,
+        received_at_s,
+        payload,
+        rssi_dbm=_signal(record.get("rssi"), math.nan),
+        snr_db=_signal(record.get("lsnr"), math.nan),
+    )
+
+
+_LORAWAN_UPLINKS = (0, 2, 4)  # message types: join request, unconfirmed and confirmed data (LoRaWAN 1.0.4, 4.2.1)
+_LORAWAN_BYTES = 12  # [byte] shortest data frame
+_READERS = {
+    UplinkKind.CHIRPSTACK: _from_chirpstack,
+    UplinkKind.THINGS_STACK: _from_things_stack,
+    UplinkKind.THINGS_NETWORK: _from_things_network,
+    UplinkKind.LORIOT: _from_loriot,
+    UplinkKind.HELIUM: _from_helium,
+    UplinkKind.AWS: _from_aws,
+    UplinkKind.ACTILITY: _from_actility,
+    UplinkKind.SEMTECH: _from_semtech,
+}
+
+
+# --- all ---------------------------------------------------------------------------------------------------------
+
+
+def _mapping(value: object) -> dict[str, object]:
+    return value if isinstance(value, dict) else {}
+
+
+def _payload_of(value: object, written: PayloadText) -> bytes:
+    payload = read_payload(value, written)
+    if not payload:
+        raise BrokenEntry("no-payload", "an uplink without a payload")
+    return payload
+
+
+def _unix_time(value: object, clock: LogClock) -> float:
+    return LogClock(offset_s=clock.offset_s).read(value)
 
 
 def _objects(value: object) -> list[dict[str, object]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def _best(receptions: list[dict[str, object]]) -> dict[str, object]:
+def _best(receptions: list[dict[str, object]], rssi: str = "rssi") -> dict[str, object]:
     """The reception of the strongest gateway; an RSSI of zero, which is left out, was not measured."""
-    return max(receptions, key=lambda reception: _signal(reception.get("rssi"), -math.inf), default={})
+    return max(receptions, key=lambda reception: _signal(reception.get(rssi), -math.inf), default={})
 
 
 def _first_time(values: tuple[object, ...], clock: LogClock) -> float:
@@ -344,7 +492,12 @@ def _first_time(values: tuple[object, ...], clock: LogClock) -> float:
 
 
 def _signal(value: object, missing: float) -> float:
-    """An RSSI or SNR; those that no receiver measures are missing."""
+    """An RSSI or SNR, also as text; those that no receiver measures are missing."""
+    if isinstance(value, str):
+        try:
+            value = read_number(value)
+        except ValueError:
+            return missing
     if isinstance(value, bool) or not isinstance(value, int | float) or not -200 <= value <= 60:
         return missing
     return float(value)
@@ -367,7 +520,8 @@ def read_json(source: PacketSource) -> Iterator[ReceivedPacket]:
     """
     sample, report = source.sample, source.report
     shapes: _Shapes = {}
-    for entry, record in read_records(sample.name, sample.text, source.limits.document_bytes):
+    records = _each_packet(read_records(sample.name, sample.text, source.limits.document_bytes))
+    for entry, record in records:
         report.entries += 1
         try:
             if isinstance(record, BrokenEntry):
@@ -375,6 +529,20 @@ def read_json(source: PacketSource) -> Iterator[ReceivedPacket]:
             yield _packet_from_record(entry, record, source, shapes)
         except BrokenEntry as broken:
             report.leave_out(entry, broken.kind, broken.reason)
+
+
+def _each_packet(records: Iterator[Record]) -> Iterator[Record]:
+    """Records; each packet of a datagram of Semtech's gateways, which holds several, is one of its own."""
+    more = 0
+    for entry, record in records:
+        packets = record.get("rxpk") if isinstance(record, dict) else None
+        if not isinstance(packets, list):
+            yield entry + more, record
+            continue
+        for packet in packets:
+            yield entry + more, _checked(packet)
+            more += 1
+        more -= 1
 
 
 def _packet_from_record(
@@ -397,7 +565,9 @@ def _packet_from_record(
     values = {quantity: event[names[place]] for quantity, place in places.items()}
     values.setdefault("time", outer_time)
     written = payload_text(names[places["payload"]] if "payload" in places else "", declaration)
-    return packet_from_values(entry, values, declaration.times, written)
+    packet = packet_from_values(entry, values, declaration.times, written)
+    note_unread_time(packet, values, source.report)
+    return packet
 
 
 def looks_like_json_dump(text: str) -> bool:

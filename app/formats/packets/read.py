@@ -88,7 +88,8 @@ PACKET_FORMATS: tuple[Format[PacketReader], ...] = (
     Format(
         PacketFormat.JSON,
         Use.PACKETS,
-        "JSON or JSON lines with the same names, or uplinks of ChirpStack v4 or The Things Stack v3",
+        "JSON or JSON lines with the same names, or uplinks of ChirpStack v4, The Things Stack v3, The Things Network "
+        "v2, Loriot, Helium, AWS IoT Core, Actility ThingPark or Semtech's gateways (rxpk)",
         _detect_json,
         read_json,
     ),

@@ -16,7 +16,7 @@ from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter
 from app.formats.format import Sample
-from app.formats.logs import LogClock, LogReport, has_zone
+from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, has_zone
 from app.formats.text import MAX_LINE, clean_text, numbered_lines, read_number, repeated_names
 from app.geodesy import check_lon_lat
 from app.inputs import Declaration, Name
@@ -50,7 +50,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "snr": ("snr", "snr_db", "lsnr", "lorasnr"),
     "time": (
         "timestamp", "time", "heard_at", "heard_at_s", "received_at", "time_s", "t_s", "datetime", "date_time", "utc",
-        "utc_time", "time_utc", "timestamp_ms", "time_ms", "unix_time",
+        "utc_time", "time_utc", "timestamp_ms", "time_ms", "unix_time", "zeit", "zeitstempel",
     ),
     "side": ("side", "lane_side", "lane"),
     "speed_kmh": ("speed_limit_kmh", "speed_limit_km_h", "speed_limit_kph"),
@@ -244,14 +244,26 @@ def _speed_limit(values: Mapping[str, object], decimal: str) -> SpeedLimit | Non
     return None
 
 
+def note_unread_time(packet: ReceivedPacket, values: Mapping[str, object], report: LogReport) -> None:
+    """Remember the first text or number that should be a time and is none that can be read."""
+    if report.unread_time is None and math.isnan(packet.received_at_s) and values.get("time") not in (None, ""):
+        report.unread_time = clean_text(str(values["time"]), 40)
+
+
 def warn_untimed(report: LogReport, packets: int, untimed: int) -> None:
     """Warn about packets without a time."""
-    if untimed:
-        report.warn(
-            f"{untimed} of {packets} packets have no time between 2000 and 2100: replays among them cannot be "
-            "detected, and the position of the vehicle is not known; declare the clock's scale or offset if there "
-            "are times"
+    if not untimed:
+        return
+    cure = "declare the clock's scale or offset if there are times"
+    if report.unread_time is not None:
+        cure = (
+            f"the first one that cannot be read is {report.unread_time!r}; times are {ACCEPTED_TIMES}, "
+            "or declare the clock's scale, offset or day_first"
         )
+    report.warn(
+        f"{untimed} of {packets} packets have no time between 2000 and 2100: replays among them cannot be "
+        f"detected, and the position of the vehicle is not known; {cure}"
+    )
 
 
 # === What is declared of a packet log, and the limits of reading one.
@@ -265,8 +277,6 @@ class PacketFormat(StrEnum):
 
     CSV = "csv"
     JSON = "json"
-    CHIRPSTACK = "chirpstack-v4"
-    THINGS_STACK = "things-stack-v3"
     RAW = "raw-payloads"
     HEX = "hex-lines"
 
@@ -331,7 +341,15 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
         report.warn(f"{source.sample.name} has several columns named {repeated!r}; the first is read")
     places = log.places(ALIASES, declaration.columns or {})
     written = payload_text(log.columns[places["payload"]] if "payload" in places else "", declaration)
-    zoned = True
+    zoned, clock = True, declaration.times
+    if "time" not in places:
+        report.warn(
+            f"{source.sample.name} has no column that is named as a time; its columns are {_shown(log.columns)}: "
+            "declare columns.time if one of them is"
+        )
+    else:
+        texts = (cells[places["time"]] for cells in log.rows() if cells is not None)
+        clock = clock.of_column(texts, "clock.day_first")
     for entry, cells in enumerate(log.rows()):
         report.entries += 1
         try:
@@ -339,7 +357,9 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
                 raise BrokenEntry("malformed", log.bad_row())
             values = {quantity: cells[place] for quantity, place in places.items()}
             zoned = zoned and _names_zone(values.get("time", ""))
-            yield packet_from_values(entry, values, declaration.times, written, decimal=log.dialect.decimal)
+            packet = packet_from_values(entry, values, clock, written, decimal=log.dialect.decimal)
+            note_unread_time(packet, values, report)
+            yield packet
         except BrokenEntry as broken:
             report.leave_out(entry, broken.kind, broken.reason)
     if not zoned and not declaration.times.utc_offset_s:
@@ -360,10 +380,14 @@ def payload_text(column: str, declaration: PacketDeclaration) -> PayloadText:
     return PayloadText.BASE64 if re.search(r"b(ase)?_?64", lower) else PayloadText.AUTO
 
 
+def _shown(columns: Iterable[str]) -> str:
+    return ", ".join(repr(clean_text(column, 40)) for column in islice(columns, 24))
+
+
 def missing_columns(source: PacketSource, wanted: Mapping[str, str]) -> InvalidParameter:
     """The error for declared columns that a log does not have."""
     quantity, column = next(iter(wanted.items()))
-    shown = ", ".join(repr(clean_text(c, 40)) for c in source.sample.log.columns[:24])
+    shown = _shown(source.sample.log.columns)
     return InvalidParameter(
         f"{source.sample.name} has no column {column!r} for {quantity}; its columns are {shown}",
         field=f"columns.{quantity}",

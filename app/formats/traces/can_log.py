@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zlib
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.text import is_clean_text, require_columns
-from app.formats.traces.declaration import CanDeclaration, CanSignal, TraceLimits, TraceReport
+from app.formats.traces.declaration import MAX_STANDARD, CanDeclaration, CanSignal, TraceLimits, TraceReport
 from app.formats.traces.parts import Part, Series
 from app.values import Floats
 
@@ -24,6 +24,20 @@ _DEFECTS = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, AssertionError, EOFError, OSError, OverflowError,
     ArithmeticError, RuntimeError, NotImplementedError, struct.error, zlib.error,
 )  # fmt: skip
+_LOGS = "asc, blf, csv (python-can, SavvyCAN), log (candump -l or -L) or trc"
+_MAX_KINDS = 4096  # kinds of frames that messages name
+_BEFORE_ZERO = "frames with negative times"
+SAVVYCAN_HEADER = re.compile(r"time stamp,\s*id,\s*extended,(.*,)?\s*bus,\s*len", re.IGNORECASE)
+"""The first line of SavvyCAN's CSV; older versions leave out Dir."""
+CANDUMP_CONSOLE = re.compile(
+    r"^\s*(?:\([^()\n]*\)\s+)?[A-Za-z]\S{0,15}\s+(?:[RT]X [-B ]{3}\s+)?(?:[0-9A-F]{3}|[0-9A-F]{8})\s+\[\d{1,2}\]",
+    re.MULTILINE,
+)
+"""A frame as candump shows it, with a time (-ta, -td, -tz, -tA) or without one."""
+_ASC_RELATIVE = re.compile(r"^\s*base\s+(?:hex|dec)\s+timestamps\s+relative", re.IGNORECASE | re.MULTILINE)
+_ASC_TRIGGER = re.compile(r"^\s*begin\s+triggerblock", re.IGNORECASE | re.MULTILINE)
+_ASC_TIME = re.compile(r"^[ \t]*\d+\.\d+(?=\s)", re.MULTILINE)
+_ASC_BEFORE_ZERO = re.compile(r"^[ \t]*-\d+\.\d+\s+(?:\d+\s+\w+\s+[RT]x|CANFD)\b", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,12 +49,44 @@ class CanSeries:
     unit: str | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Frames:
-    """Frames of one identifier."""
+_ANY_SOURCE = 0xFE
+"""From this source address on, J1939 names no single sender: 0xFE is the null address, 0xFF the global one."""
 
-    t_s: Floats
-    data: list[bytes]
+
+class _FrameKind(NamedTuple):
+    """What frames of one sender share."""
+
+    arbitration_id: int
+    is_extended: bool  # of 29 bits, not of 11
+    channel: str | None  # as the file writes it; None where it writes none
+
+    @property
+    def identifier(self) -> str:
+        """As logs write it: 8 digits if it is of 29 bits."""
+        return f"0x{self.arbitration_id:08X}" if self.is_extended else f"0x{self.arbitration_id:X}"
+
+    def matches(self, signal: CanSignal) -> bool:
+        """Whether such frames may hold a signal."""
+        wanted = signal.arbitration_id or 0
+        if self.arbitration_id == wanted:
+            return True
+        if not (self.is_extended and signal.extended and wanted & 0xFF >= _ANY_SOURCE):
+            return False
+        return _parameter_group(self.arbitration_id) == _parameter_group(wanted)
+
+
+def _parameter_group(arbitration_id: int) -> int:
+    """The parameter group number (PGN) of an identifier of J1939: without priority, destination and source."""
+    group = arbitration_id >> 8 & 0x3FFFF
+    return group if group >> 8 & 0xFF >= 240 else group & 0x3FF00  # PDU1: the low byte is the destination
+
+
+@dataclass(slots=True)
+class _Frames:
+    """Frames of one kind: times after the first frame of the log [s], and bytes."""
+
+    t_s: list[float] = field(default_factory=list)
+    data: list[bytes] = field(default_factory=list)
 
 
 def read_can_log(
@@ -71,34 +117,25 @@ def read_can_log(
     placed: dict[str, tuple[CanSignal, Callable[[bytes], float | None] | None]] = {}
     for name, signal in signals.items():
         placed[name] = (signal, None) if signal.name is None else _from_dbc(signal, dbc, f"can.{name}")
-    wanted = {signal.arbitration_id for signal, _ in placed.values()}
-    frames, seen = _read_frames(part, wanted, declaration.channel, limits, report)
+    frames = _read_frames(part, [signal for signal, _ in placed.values()], limits, report)
     series = {}
     for name, (signal, decode) in placed.items():
-        group = frames.get(signal.arbitration_id or 0)
-        if group is None:
-            raise InvalidParameter(
-                f"{part.name} has no frames 0x{signal.arbitration_id:X}; it has "
-                + ", ".join(f"0x{i:X}" for i in sorted(seen)[:16]),
-                field=f"can.{name}",
-                limit=f"0x{signal.arbitration_id:X}",
-                cure="declare the identifier that carries it",
-            )
+        kind = _choose_kind(part.name, frames, signal, declaration.channel, f"can.{name}", report)
+        group = frames[kind]
         value = _extract(group.data, signal) if decode is None else _decode(group.data, decode)
-        t, value = _valid(group.t_s, value, signal, part.name, name, report)
+        t, value = _valid(np.array(group.t_s), value, signal, part.name, name, report)
         series[name] = CanSeries(t, value, signal.unit)
     return series
 
 
 def _read_frames(
-    part: Part, wanted: set[int | None], channel: int | str | None, limits: TraceLimits, report: TraceReport
-) -> tuple[dict[int, _Frames], set[int]]:
-    times: dict[int, list[float]] = defaultdict(list)
-    data: dict[int, list[bytes]] = defaultdict(list)
-    seen: set[int] = set()
+    part: Part, signals: Collection[CanSignal], limits: TraceLimits, report: TraceReport
+) -> dict[_FrameKind, _Frames]:
+    """Frames by their kind; those that hold no signal are only named, with empty lists."""
+    kinds: dict[tuple[int, bool, object], tuple[_Frames, bool]] = {}
     first: float | None = None
-    count = 0
-    messages = _messages(part)
+    count = negative = 0
+    messages, first_channel = _messages(part, report)
     try:
         for message in messages:
             count += 1
@@ -109,17 +146,23 @@ def _read_frames(
                     limit=f"{limits.can_frames} frames",
                     cure="filter the log by identifier, or cut it",
                 )
+            if message.timestamp < 0:
+                negative += 1
+                continue
             if first is None:
                 first = float(message.timestamp)
             if message.is_error_frame or message.is_remote_frame:
                 continue
-            if channel is not None and str(message.channel) != str(channel):
-                continue
-            if len(seen) < 4096:
-                seen.add(message.arbitration_id)
-            if message.arbitration_id in wanted:
-                times[message.arbitration_id].append(float(message.timestamp) - first)
-                data[message.arbitration_id].append(bytes(message.data))
+            key = (message.arbitration_id, message.is_extended_id, message.channel)
+            known = kinds.get(key)
+            if known is None:
+                kind = _FrameKind(*key[:2], None)
+                known = _Frames(), any(kind.matches(signal) for signal in signals)
+                if known[1] or len(kinds) < _MAX_KINDS:
+                    kinds[key] = known
+            if known[1]:
+                known[0].t_s.append(float(message.timestamp) - first)
+                known[0].data.append(bytes(message.data))
     except WaymarkError:
         raise
     except _DEFECTS as error:
@@ -127,19 +170,98 @@ def _read_frames(
             raise UnreadableUpload(
                 f"{part.name} cannot be read as a CAN log",
                 field=part.name,
-                limit="asc, blf, csv, log (candump) or trc",
+                limit=_LOGS,
                 cure="export it again; give the file the suffix of its format",
             ) from error
         report.leave_out(part.name, "log-cut-short", 1, f"the log is damaged after frame {count}; the rest is left out")
-    if not count:
+    report.leave_out(part.name, "frames-before-zero", negative, _BEFORE_ZERO)
+    if count == negative:
         raise UnreadableUpload(
-            f"{part.name} holds no CAN frames", field=part.name, limit="one or more", cure="check the log's format"
+            f"{part.name} holds no CAN frames" + (" at times from 0 s on" if negative else ""),
+            field=part.name,
+            limit="one or more",
+            cure="check the log's format",
         )
-    return {i: _Frames(np.array(times[i]), data[i]) for i in times}, seen
+    return {
+        _FrameKind(number, extended, _written_channel(channel, first_channel)): frames
+        for (number, extended, channel), (frames, _wanted) in kinds.items()
+    }
 
 
-def _messages(part: Part) -> Iterator[Any]:
-    """Frames by the reader of the file's format."""
+def _written_channel(channel: object, first_channel: int) -> str | None:
+    """A channel as the file writes it: python-can counts those of ASC and BLF from 0, the files from 1."""
+    return str(channel + first_channel) if isinstance(channel, int) else channel if isinstance(channel, str) else None
+
+
+def _choose_kind(
+    name: str,
+    frames: dict[_FrameKind, _Frames],
+    signal: CanSignal,
+    channel: int | str | None,
+    field: str,
+    report: TraceReport,
+) -> _FrameKind:
+    """The one kind of frames that holds a signal.
+
+    Raises
+    ------
+    InvalidParameter
+        There are no such frames, or several kinds of them: on several channels, or from several senders.
+    """
+    number = signal.arbitration_id or 0
+    extended = number > MAX_STANDARD if signal.extended is None else signal.extended
+    if channel is not None and not any(kind.channel == str(channel) for kind in frames):
+        shown = sorted({kind.channel for kind in frames if kind.channel is not None})
+        raise InvalidParameter(
+            f"{name} has no frames of channel {channel}; "
+            + (f"its channels are {', '.join(shown[:16])}" if shown else "it does not write channels"),
+            field="can.channel",
+            limit=", ".join(shown[:16]) or "left out",
+            cure="declare a channel as the file writes it, or none",
+        )
+    there = {kind for kind in frames if channel is None or kind.channel == str(channel)}
+    found = {kind for kind in there if kind.matches(signal) and kind.is_extended == extended}
+    if exact := {kind for kind in found if kind.arbitration_id == number}:
+        found = exact
+    if not found and signal.extended is None and (others := {kind for kind in there if kind.arbitration_id == number}):
+        found = others
+        report.warn(
+            f"{name} has 0x{number:X} only as a 29-bit identifier, and it was read as such; "
+            f"declare {field}.extended to confirm this"
+        )
+    senders = sorted({kind.identifier for kind in found})
+    if not senders:
+        seen = sorted({kind[:2]: kind.identifier for kind in there}.items())
+        raise InvalidParameter(
+            f"{name} has no frames {_FrameKind(number, extended, None).identifier}"
+            + (f" on channel {channel}" if channel is not None else "")
+            + f" ({29 if extended else 11}-bit identifier); it has "
+            + ", ".join(identifier for _key, identifier in seen[:16]),
+            field=field,
+            limit=_FrameKind(number, extended, None).identifier,
+            cure="declare the identifier that carries it, and extended if it has 29 bits although it is small",
+        )
+    if len(senders) > 1:
+        raise InvalidParameter(
+            f"several identifiers in {name} carry parameter group {_parameter_group(number)} of J1939: "
+            + ", ".join(senders[:16]),
+            field=f"{field}.arbitration_id",
+            limit=", ".join(senders[:16]),
+            cure="declare, beside the name of the signal, the identifier of one of them",
+        )
+    if len(found) > 1:
+        shown = sorted(str(kind.channel) for kind in found)
+        raise InvalidParameter(
+            f"several channels of {name} carry {senders[0]}: {', '.join(shown[:16])}",
+            field="can.channel",
+            limit=", ".join(shown[:16]),
+            cure="declare the channel",
+        )
+    return found.pop()
+
+
+def _messages(part: Part, report: TraceReport) -> tuple[Iterator[Any], int]:
+    """Frames by the reader of the file's format, and what is added to their channels to get those in the file."""
     try:
         import can
     except ImportError as error:
@@ -150,21 +272,73 @@ def _messages(part: Part) -> Iterator[Any]:
         ) from error
     content = part.content()
     if content.startswith(b"LOGG"):
-        return iter(can.BLFReader(io.BytesIO(content)))
+        return iter(can.BLFReader(io.BytesIO(content))), 1
     if not is_clean_text(content):
-        raise UnsupportedUpload(
-            f"{part.name} is no CAN log that is read here", field=part.name, limit="asc, blf, csv, log, trc"
-        )
-    text = io.StringIO(content.decode("utf-8-sig", "replace"))
+        raise UnsupportedUpload(f"{part.name} is no CAN log that is read here", field=part.name, limit=_LOGS)
+    text = content.decode("utf-8-sig", "replace")
     suffix = part.name.rsplit(".", 1)[-1].lower()
-    head = content[:4096].lower()
-    if b"arbitration_id" in head.split(b"\n", 1)[0]:
-        return iter(can.CSVReader(text))
-    if suffix == "trc" or head.startswith(b";$fileversion"):
-        return iter(can.TRCReader(text))
-    if suffix == "log" or head.lstrip().startswith(b"("):
-        return iter(can.CanutilsLogReader(text))
-    return iter(can.ASCReader(text))
+    head = text[:4096]
+    first = head.split("\n", 1)[0].lower()
+    if "arbitration_id" in first:
+        return iter(can.CSVReader(io.StringIO(text))), 0
+    if SAVVYCAN_HEADER.match(first):
+        return _read_savvycan(text), 0
+    if CANDUMP_CONSOLE.search(head):
+        raise UnsupportedUpload(
+            f"{part.name} is what candump shows on a console, not a log file of candump",
+            field=part.name,
+            limit=_LOGS,
+            cure="record with candump -l, or with candump -L and its output in a file",
+        )
+    if suffix == "trc" or head.lower().startswith(";$fileversion"):
+        return iter(can.TRCReader(io.StringIO(text))), 0
+    if suffix == "log" or head.lstrip().startswith("("):
+        return iter(can.CanutilsLogReader(io.StringIO(text))), 0
+    report.leave_out(part.name, "frames-before-zero", len(_ASC_BEFORE_ZERO.findall(text)), _BEFORE_ZERO)
+    if _ASC_RELATIVE.search(head):
+        text = _with_absolute_times(part.name, text)
+    return iter(can.ASCReader(io.StringIO(text))), 1
+
+
+def _with_absolute_times(name: str, text: str) -> str:
+    """An ASC file with relative times, which are intervals since the line before, with times since its first line."""
+    if len(_ASC_TRIGGER.findall(text)) > 1:
+        raise UnsupportedUpload(
+            f"{name} has relative times and several trigger blocks, and does not show the time between them",
+            field=name,
+            limit="one trigger block, or absolute times",
+            cure="export the log with absolute times",
+        )
+    passed_s = 0.0
+
+    def absolute(found: re.Match[str]) -> str:
+        nonlocal passed_s
+        passed_s += float(found[0])
+        return f"{passed_s:.9f}"
+
+    return _ASC_TIME.sub(absolute, text)
+
+
+def _read_savvycan(text: str) -> Iterator[Any]:
+    """Frames of a CSV file as SavvyCAN writes it: times in microseconds, identifiers and bytes in hexadecimal."""
+    import can
+
+    lines = iter(text.splitlines())
+    place = {name.strip().lower(): i for i, name in enumerate(next(lines).split(","))}
+    time, number, extended, bus, length = (place[n] for n in ("time stamp", "id", "extended", "bus", "len"))
+    for line in lines:
+        if not line.strip():
+            continue
+        cells = [cell.strip() for cell in line.split(",")]
+        data = bytes(int(cell, 16) for cell in cells[length + 1 : length + 1 + int(cells[length])])
+        yield can.Message(
+            timestamp=1e-6 * float(cells[time]),
+            arbitration_id=int(cells[number], 16) & 0x1FFFFFFF,
+            is_extended_id=cells[extended].lower() in ("true", "1"),
+            channel=int(cells[bus]),
+            data=data,
+            is_fd=len(data) > 8,
+        )
 
 
 def _from_dbc(
@@ -176,7 +350,10 @@ def _from_dbc(
     placed = signal.model_copy(
         update={
             "name": None,
-            "arbitration_id": int(message.frame_id),
+            "arbitration_id": int(message.frame_id) if signal.arbitration_id is None else signal.arbitration_id,
+            "extended": bool(message.is_extended_frame or (signal.arbitration_id or 0) > MAX_STANDARD)
+            if signal.extended is None
+            else signal.extended,
             "start_bit": int(entry.start),
             "length": int(entry.length),
             "byte_order": "little" if entry.byte_order == "little_endian" else "big",

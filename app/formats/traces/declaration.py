@@ -63,11 +63,25 @@ class TraceColumns(Declaration):
         return self.field or tuple((f"s{i}_x", f"s{i}_y", f"s{i}_z") for i in range(1, sensors + 1))
 
 
+MAX_STANDARD = 0x7FF
+"""Largest CAN identifier of 11 bits (ISO 11898-1)."""
+
+
 class CanSignal(Declaration):
     """A signal by its name in a DBC, or by identifier, bits and scaling."""
 
     name: Name | None = Field(None, description="`Message.Signal` where the name alone is not unique.")
-    arbitration_id: Whole | None = Field(None, ge=0, le=0x1FFFFFFF)
+    arbitration_id: Whole | None = Field(
+        None,
+        ge=0,
+        le=0x1FFFFFFF,
+        description="Beside a name: used instead of that of the DBC, to choose one of several senders of J1939.",
+    )
+    extended: Flag | None = Field(
+        None,
+        description="Whether the identifier has 29 bits, not 11. If left out, it is as in the DBC; without a DBC it "
+        "has 29 bits if it is above 0x7FF, or if the log has it only so.",
+    )
     start_bit: Whole = Field(
         0,
         ge=0,
@@ -85,8 +99,10 @@ class CanSignal(Declaration):
 
     @model_validator(mode="after")
     def _is_placed(self) -> CanSignal:
-        if (self.name is None) == (self.arbitration_id is None):
+        if self.name is None and self.arbitration_id is None:
             raise InvalidParameter("a CAN signal has a name in a DBC, or an identifier and bits", limit="one of both")
+        if self.extended is False and (self.arbitration_id or 0) > MAX_STANDARD:
+            raise InvalidParameter("an identifier above 0x7FF has 29 bits", field="extended", limit="true or left out")
         if self.factor == 0:
             raise InvalidParameter("the factor of a CAN signal is 0", field="factor", limit="not 0")
         return self
@@ -101,7 +117,9 @@ class CanDeclaration(Declaration):
     offset_s: Number | None = Field(
         None, description="Trace time of the log's first frame; left out, it is found from the wheels' noise. [s]"
     )
-    channel: Name | Whole | None = Field(None, description="Only frames of this channel.")
+    channel: Name | Whole | None = Field(
+        None, description="Only frames of this channel, as the file writes it: 1, can0, vcan1."
+    )
 
 
 class TraceDeclaration(Declaration):

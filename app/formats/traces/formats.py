@@ -12,7 +12,7 @@ import numpy.typing as npt
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload
 from app.formats.bags.messages import SIGNATURES
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
-from app.formats.traces.can_log import CanSeries, read_can_log
+from app.formats.traces.can_log import CANDUMP_CONSOLE, SAVVYCAN_HEADER, CanSeries, read_can_log
 from app.formats.traces.declaration import (
     AngleUnit,
     FieldUnit,
@@ -33,6 +33,8 @@ _TEXT_SUFFIXES = (".csv", ".txt", ".dbc", ".asc", ".trc", ".log", ".json", ".xls
 _BINARY_SIGNATURES = (b"PAR1", b"LOGG")
 _BINARY = (TraceFormat.PARQUET, TraceFormat.CAN, TraceFormat.STREAM, TraceFormat.BAG)
 _UT_PER_TESLA = 1e6
+_CANDUMP = re.compile(r"\(\d+\.\d+\) \S+ [0-9A-F]{3,8}#|" + CANDUMP_CONSOLE.pattern)
+"""A frame of candump's log file, or as it shows it on a console: then the file is refused by name."""
 _TRACE_COLUMN = re.compile(r"(s\d+_[xyz]|sensor .*|arbitration_id|time stamp)\Z", re.IGNORECASE)
 
 
@@ -214,7 +216,9 @@ def _detect_dbc(sample: Sample) -> Confidence:
 def _detect_can(sample: Sample) -> Confidence:
     if sample.data.startswith(b"LOGG"):
         return Confidence.CERTAIN
-    if sample.is_clean_text and "arbitration_id" in _columns(sample):
+    if not sample.is_clean_text:
+        return Confidence.NONE
+    if "arbitration_id" in _columns(sample) or SAVVYCAN_HEADER.match(sample.start) or _CANDUMP.match(sample.start):
         return Confidence.LIKELY
     return _detect_text(sample) if sample.suffix in _CAN_SUFFIXES else Confidence.NONE
 

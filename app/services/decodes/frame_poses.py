@@ -17,7 +17,7 @@ from typing_extensions import TypedDict
 from app.decoding.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.formats.frame_list import FrameList, ListedFrame
 from app.formats.images import PicturePosition
-from app.formats.logs import LogReport, has_zone
+from app.formats.logs import LogReport, describe_rollover, has_zone
 from app.formats.text import TableWriter
 from app.geodesy.frames import metres_per_radian
 from app.registry.decodes import DecodeRow, StoredResult
@@ -126,12 +126,17 @@ class GapDocument(TypedDict):
 class FramePlaces:
     """Times and places of the frames of one drive."""
 
-    def __init__(self, context: DecodeContext, lists: FrameLists | None = None) -> None:
+    def __init__(
+        self, context: DecodeContext, lists: FrameLists | None = None, observed_at: datetime | None = None
+    ) -> None:
         self._context, self._frames = context, context.frames or DeclaredFrames()
         self._lists = lists or FrameLists()
         self._listed: Mapping[str, ListedFrame] = self._lists.frames.frames if self._lists.frames else {}
         self._track = self._lists.track or _track_of_list(self._listed)
         self.warnings = list(self._lists.warnings)
+        if self._track is not None and len(self._track.time_s) and observed_at is not None:
+            rollover = describe_rollover(float(self._track.time_s[0]), observed_at.timestamp())
+            self.warnings += [rollover] if rollover else []
 
     @property
     def receiver(self) -> ReceiverPositions | None:

@@ -343,7 +343,7 @@ class PendingArchive:
             )
             poses = (context.frames or DeclaredFrames()).track
             lists = self._processes.run(read_frame_lists, files, poses, wait_s=self._upload.wait_s)
-            self._places = FramePlaces(context, lists)
+            self._places = FramePlaces(context, lists, self._upload.observed_at)
         self._places.check_names([name for name in names if not is_beside_frames(name)])
 
     def _prepare(self, member: Member) -> ArchiveFrame:

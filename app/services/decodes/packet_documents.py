@@ -249,7 +249,7 @@ def _report(files: DriveFiles, read: ReadPackets, result: LaneResult) -> PacketR
         for entry in report.left_out
     ]
     warnings = [text for report in files.reports.values() for text in report.warnings]
-    warnings += [*read.verification.warnings, *read.merged.warnings]
+    warnings += [*read.warnings, *read.verification.warnings, *read.merged.warnings]
     if files.track is not None and _is_of_another_time(files):
         warnings.append(
             "no packet was received while the vehicle's track lasts: how far away markers were is not known; the track "

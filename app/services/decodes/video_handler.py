@@ -163,7 +163,7 @@ class PendingVideo:
             video = packed.video
             if packed.beside:
                 lists = self._processes.run(read_frame_lists, packed.beside, declared.track, wait_s=wait_s)
-                self._places = FramePlaces(context, lists)
+                self._places = FramePlaces(context, lists, upload.observed_at)
         else:
             video = VideoFile(upload.file, kind)
         index = self._processes.run(index_frames, video, self._rules.videos, declared.rate_hz, wait_s=wait_s)
@@ -178,7 +178,7 @@ class PendingVideo:
             for gap in index.gaps
         ]
         if index.track is not None:
-            self._places = FramePlaces(context, FrameLists(track=index.track))
+            self._places = FramePlaces(context, FrameLists(track=index.track), upload.observed_at)
         self._signal.receiver = self._places.receiver
         self._began_at = index.created_at if index.has_clock else context.captured_at
         if self._began_at is None and index.created_at is not None:

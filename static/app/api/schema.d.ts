@@ -2854,6 +2854,8 @@ export interface components {
              * @enum {string}
              */
             byte_order?: "little" | "big";
+            /** @default null */
+            extended?: boolean | null;
             /** @default 1 */
             factor?: number;
             /** @default 16 */
@@ -4568,6 +4570,8 @@ export interface components {
             feet: components["schemas"]["FootDocument"][];
         };
         LogClock: {
+            /** @default null */
+            day_first?: boolean | null;
             /** @default 0 */
             offset_s?: number;
             /** @default auto */

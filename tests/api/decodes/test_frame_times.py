@@ -76,6 +76,22 @@ def test_a_track_and_a_frame_rate(client: httpx.Client, plate: dict[str, Any]) -
     assert all(reading["match"]["marker_id"] == plate["id"] for reading in decode["readings"])
 
 
+def test_a_track_a_week_rollover_behind_is_warned_of(client: httpx.Client, plate: dict[str, Any]) -> None:
+    lon, lat = plate["position"]["lon_deg"], plate["position"]["lat_deg"]
+    track = "time,lon,lat\n" + "".join(f"2006-09-18T08:30:{k:02d}Z,{lon},{lat + k * 1e-4}\n" for k in range(5))
+    archive = pack({"0.png": GOOD, "poses.csv": track.encode()})
+    context: dict[str, Any] = {"captured_at": "2026-05-04T08:30:01Z", "frames": {"rate_hz": 2.0}}
+    decode = wait_for(client, post_frame(client, archive, context, name="d.zip").headers["location"])
+    (warning,) = [text for text in decode["warnings"] if "rollover" in text]
+    assert "2006-09-18" in warning
+    assert "1024 weeks" in warning
+    assert "2026-05-04" in warning
+    context["frames"]["poses"] = {"clock": {"offset_s": 619315200}}  # what the warning asks for
+    decode = wait_for(client, post_frame(client, archive, context, name="d.zip").headers["location"])
+    assert decode["warnings"] == []
+    assert decode["frames"][0]["pose"]["source"] == "track"
+
+
 def test_a_list_that_cannot_be_read_fails_the_job_with_its_reason(client: httpx.Client, plate: dict[str, Any]) -> None:
     answer = post_frame(client, pack({"a.png": GOOD, "frames.csv": b"when,where\n1,2\n"}), near(plate), name="d.zip")
     decode = finished(client, answer.headers["location"])

@@ -237,6 +237,18 @@ def test_a_track_of_another_day_is_said(road: tuple[httpx.Client, BuiltLane]) ->
     assert not any("no packet" in text for text in decoded(client, packed(heard))["report"]["warnings"])
 
 
+def test_a_track_a_week_rollover_behind_is_warned_of(road: tuple[httpx.Client, BuiltLane]) -> None:
+    client, built = road
+    heard, _hour = drive(built, 1916)
+    behind = replace(heard, track=replace(heard.track, time_s=heard.track.time_s - 1024 * 7 * 86_400.0))
+    at = datetime.fromtimestamp(float(heard.track.time_s[0]), UTC).isoformat()
+    found = decoded(client, packed(behind), {"packets": {}, "captured_at": at})
+    assert any("1024 weeks" in warning for warning in found["report"]["warnings"])
+    cured = {"packets": {"poses": {"clock": {"offset_s": 619315200}}}, "captured_at": at}
+    again = decoded(client, packed(behind), cured)
+    assert not any("weeks" in warning or "no packet" in warning for warning in again["report"]["warnings"])
+
+
 def test_packets_without_poses_or_times_still_give_a_lane(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     heard, _hour = drive(built, 1903)

@@ -7,12 +7,14 @@ import json
 import math
 from datetime import UTC, datetime
 from time import process_time
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.logs import LogClock, TimeScale, utc_from_gps_s
+from app.formats.packets.json import UplinkKind
 from app.formats.packets.read import PacketLog, read_packets
 from app.formats.packets.rows import PacketDeclaration, PacketFormat, PacketLimits, PayloadText
 from app.markers.cerpm import LaneSide, SpeedLimit, SpeedUnit
@@ -193,6 +195,51 @@ def test_what_times_do_not_say_is_said() -> None:
     assert "without a zone" in local.report.warnings[0]
 
 
+@pytest.mark.parametrize(
+    ("written", "day_first"),
+    [
+        ("01.06.2026 08:00:00", None),
+        ("01.06.2026 08:00", None),
+        ("01.06.2026, 08:00:00", None),
+        ("1.6.2026 8:00", None),
+        ("2026/06/01 08:00", None),
+        ("06/01/2026 8:00 AM", False),
+        ("6/1/2026, 8:00:00 a.m.", False),
+        ("6/1/2026, 8:00:00\u202fAM", False),  # of browsers
+        ("01/06/2026 08:00:00", True),
+        ("01-06-2026 08:00:00", True),
+    ],
+)
+def test_dates_of_spreadsheets(written: str, day_first: bool | None) -> None:
+    clock = LogClock(utc_offset_s=7200, day_first=day_first)
+    log = read(f"Zeit;RSSI;Payload\n{written};-50;{PAYLOAD.hex()}\n", PacketDeclaration(clock=clock))
+    assert log.packets[0].received_at_s == datetime(2026, 6, 1, 6, 0, tzinfo=UTC).timestamp()
+    assert not log.report.warnings
+    assert math.isnan(clock.read(written.replace("01", "41").replace("1/", "41/").replace("1.6", "41.6")))
+
+
+def test_the_order_of_day_and_month_is_found_or_asked_for() -> None:
+    def table(*dates: str) -> str:
+        return "time;payload\n" + "".join(f"{at};{PAYLOAD.hex()}\n" for at in dates)
+
+    june_s = datetime(2026, 6, 1, 20, 0, tzinfo=UTC).timestamp()
+    assert read(table("01/06/2026 20:00", "13/06/2026 20:00")).packets[0].received_at_s == june_s
+    assert read(table("6/1/2026 8:00 PM", "6/13/2026 8:00 PM")).packets[0].received_at_s == june_s
+    assert read(table("05/05/2026 12:00 AM")).packets[0].received_at_s == datetime(2026, 5, 5, tzinfo=UTC).timestamp()
+    for dates in (("01/06/2026 08:00",), ("13/06/2026 08:00", "06/13/2026 08:00")):
+        with pytest.raises(InvalidParameter, match="day or the month") as caught:
+            read(table(*dates))
+        assert caught.value.field == "clock.day_first"
+        assert dates[0] in caught.value.message
+        assert "2026-06-01T08:00:00Z" in str(caught.value.cure)
+    shown = read(table("Montag um acht")).report.warnings[-1]
+    assert "'Montag um acht'" in shown
+    assert "2026-06-01T08:00:00Z" in shown
+    unnamed = read(f"wann;payload\n2026-06-01T08:00:00Z;{PAYLOAD.hex()}\n").report.warnings[0]
+    assert "'wann'" in unnamed
+    assert "columns.time" in unnamed
+
+
 # --- raw ----------------------------------------------------------------------------------------------------------
 
 
@@ -236,7 +283,7 @@ def test_a_broken_line_of_hex() -> None:
 def test_chirpstack() -> None:
     log = read(json.dumps(chirpstack(PAYLOAD), indent=2))
     (packet,) = log.packets
-    assert log.report.format == PacketFormat.CHIRPSTACK
+    assert log.report.format == UplinkKind.CHIRPSTACK
     assert packet.payload == PAYLOAD
     assert packet.received_at_s == pytest.approx(AT_S + 0.656322, abs=1e-5)
     assert (packet.rssi_dbm, packet.snr_db) == (-103.0, 0.0)  # the stronger gateway; its SNR of 0 is left out
@@ -258,7 +305,7 @@ def test_chirpstacks_times_where_some_are_missing() -> None:
 def test_the_things_stack() -> None:
     log = read(json.dumps(things_stack(PAYLOAD)))
     (packet,) = log.packets
-    assert log.report.format == PacketFormat.THINGS_STACK
+    assert log.report.format == UplinkKind.THINGS_STACK
     assert packet.payload == PAYLOAD
     assert packet.received_at_s == pytest.approx(datetime(2026, 5, 25, 13, 42, 11, 412680, UTC).timestamp(), abs=1e-5)
     assert (packet.rssi_dbm, packet.snr_db) == (-99.0, 0.0)
@@ -297,13 +344,125 @@ def test_events_as_they_are_stored(text: str) -> None:
     log = read(text)
     assert payloads(log) == [PAYLOAD] * 3
     assert [p.entry for p in log.packets] == [0, 1, 2]
-    assert log.report.format == PacketFormat.CHIRPSTACK
+    assert log.report.format == UplinkKind.CHIRPSTACK
     assert not log.report.left_out
 
 
 def test_an_event_in_a_console_stream() -> None:
     event = {"name": "as.up.data.forward", "time": "2026-05-25T13:42:12Z", "data": things_stack(PAYLOAD)}
     assert payloads(read(json.dumps([event]))) == [PAYLOAD]
+
+
+BASE64 = base64.b64encode(PAYLOAD).decode()
+UPLINKS: dict[UplinkKind, dict[str, Any]] = {
+    UplinkKind.THINGS_NETWORK: {
+        "app_id": "road", "dev_id": "cerpm-7", "hardware_serial": "0101010101010107", "port": 1, "counter": 2,
+        "payload_raw": BASE64, "payload_fields": {},
+        "metadata": {
+            "time": "2026-03-16T13:39:32.000000001Z", "frequency": 868.1, "modulation": "LORA", "data_rate": "SF7BW125",
+            "coding_rate": "4/5",
+            "gateways": [
+                {"gtw_id": "eui-1", "timestamp": 1, "time": "", "channel": 0, "rssi": -110, "snr": -3},
+                {"gtw_id": "eui-2", "timestamp": 1, "time": "", "channel": 0, "rssi": -60, "snr": 7.2},
+            ],
+        },
+    },
+    UplinkKind.LORIOT: {
+        "cmd": "rx", "seqno": 12, "EUI": "0101010101010107", "ts": int(AT_S * 1e3), "fcnt": 1, "port": 1,
+        "freq": 868100000, "rssi": -60, "snr": 7.2, "toa": 61, "dr": "SF7 BW125 4/5", "ack": False, "bat": 255,
+        "offline": False, "data": PAYLOAD.hex(),
+    },
+    UplinkKind.HELIUM: {
+        "app_eui": "6081F9BF908E2EA0", "dev_eui": "0101010101010107", "devaddr": "9C000148", "fcnt": 2, "port": 2,
+        "hotspots": [
+            {"channel": 1, "frequency": 904.1, "name": "a", "reported_at": int(AT_S * 1e3), "rssi": -60, "snr": 7.2}
+        ],
+        "id": "e1", "name": "cerpm-7", "payload": BASE64, "payload_size": 24, "reported_at": int(AT_S * 1e3),
+        "type": "uplink", "uuid": "2d7d3a6f-e5a5-4d0e-b0d1-d1bd0d70a7f1",
+    },
+    UplinkKind.AWS: {
+        "MessageId": "m", "WirelessDeviceId": "d", "PayloadData": BASE64,
+        "WirelessMetadata": {
+            "LoRaWAN": {
+                "DevEui": "0101010101010107", "FCnt": 1, "FPort": 2, "Frequency": "868100000", "DataRate": "5",
+                "Gateways": [{"GatewayEui": "80029cfffe5cf1cc", "Rssi": -60, "Snr": 7.2}],
+                "Timestamp": "2026-03-16T13:39:32Z",
+            }
+        },
+    },
+    UplinkKind.ACTILITY: {
+        "DevEUI_uplink": {
+            "Time": "2026-03-16T14:39:32.000+01:00", "DevEUI": "0101010101010107", "FPort": "2", "FCntUp": "7",
+            "MType": "2", "payload_hex": PAYLOAD.hex(), "mic_hex": "38e7a3b9", "Lrcid": "00000065",
+            "LrrRSSI": "-60.000000", "LrrSNR": "7.2", "SpFact": "7", "CustomerID": "100000507",
+        }
+    },
+    UplinkKind.SEMTECH: {
+        "rxpk": [
+            {
+                "time": "2026-03-16T13:39:32.000000Z", "tmst": 3512348611, "chan": 2, "rfch": 0, "freq": 866.349812,
+                "stat": 1, "modu": "LORA", "datr": "SF7BW125", "codr": "4/6", "rssi": -60, "lsnr": 7.2, "size": 24,
+                "data": BASE64,
+            }
+        ]
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", UPLINKS)
+def test_uplinks_of_other_servers(kind: UplinkKind) -> None:
+    event = UPLINKS[kind]
+    for text in (json.dumps(event), json.dumps([event]), f"topic {json.dumps(event)}\n"):
+        log = read(text)
+        assert log.report.format == kind
+        (packet,) = log.packets
+        assert packet.payload == PAYLOAD
+        assert packet.received_at_s == pytest.approx(AT_S, abs=1e-3)
+        assert (packet.rssi_dbm, packet.snr_db) == (-60.0, 7.2)
+        assert packet.device == (None if kind is UplinkKind.SEMTECH else "0101010101010107")
+        assert not log.report.warnings
+    clock = LogClock(offset_s=3.0)
+    assert read(json.dumps(event), PacketDeclaration(clock=clock)).packets[0].received_at_s == pytest.approx(AT_S + 3)
+
+
+def test_one_uplink_of_loriot_comes_twice() -> None:
+    rx = UPLINKS[UplinkKind.LORIOT]
+    gateways = [{"rssi": -113, "snr": -9.2, "gweui": "A"}, {"rssi": -50, "snr": 8.0, "gweui": "B"}]
+    gw = {name: value for name, value in rx.items() if name not in ("rssi", "snr")} | {"cmd": "gw", "gws": gateways}
+    first, second = read(json.dumps(rx) + "\n" + json.dumps(gw)).packets
+    assert first.event == second.event
+    assert (second.rssi_dbm, second.snr_db) == (-50.0, 8.0)
+
+
+def test_datagrams_of_gateways() -> None:
+    (packet,) = UPLINKS[UplinkKind.SEMTECH]["rxpk"]
+    gps = {name: value for name, value in packet.items() if name != "time"} | {"tmms": 1457703590000}
+    frame = packet | {"data": base64.b64encode(b"\x40" + bytes(36)).decode()}
+    broken = packet | {"stat": -1}
+    lines = [{"rxpk": [packet, gps], "stat": {"rxnb": 2}}, {"rxpk": [frame]}, {"rxpk": [broken, packet]}]
+    log = read("\n".join(json.dumps(line) for line in lines))
+    assert [one.entry for one in log.packets] == [0, 1, 4]
+    assert [one.received_at_s for one in log.packets] == [AT_S] * 3
+    assert [left.entry for left in log.report.left_out] == [2, 3]
+    assert "network server" in log.report.left_out[0].reason
+    assert "checksum" in log.report.left_out[1].reason
+
+
+def test_what_is_no_uplink_of_other_servers_is_named() -> None:
+    loriot, actility = UPLINKS[UplinkKind.LORIOT], UPLINKS[UplinkKind.ACTILITY]
+    events: list[tuple[dict[str, Any], str]] = [
+        ({"cmd": "txd", "EUI": "01", "seqdn": 3}, "txd"),
+        (loriot | {"data": "", "encdata": "0102"}, "encrypted"),
+        (UPLINKS[UplinkKind.HELIUM] | {"type": "join"}, "join"),
+        ({"WirelessMetadata": {"Sidewalk": {"Seq": 1}}, "PayloadData": BASE64}, "LoRaWAN"),
+        ({"DevEUI_location": {"DevEUI": "01"}}, "DevEUI_location"),
+        ({"DevEUI_uplink": actility["DevEUI_uplink"] | {"payload_encryption": "1"}}, "encrypted"),
+        (UPLINKS[UplinkKind.THINGS_NETWORK] | {"payload_raw": ""}, "without a payload"),
+    ]
+    log = read("\n".join(json.dumps(event) for event in [*(event for event, _reason in events), loriot]))
+    assert len(log.packets) == 1
+    for left, (_event, reason) in zip(log.report.left_out, events, strict=True):
+        assert reason in left.reason
 
 
 def test_what_is_no_uplink_is_named() -> None:

@@ -141,6 +141,37 @@ def test_declared_columns_and_clocks() -> None:
         read(text, columns={"time": "when", "lon": "x", "lat": "z"})
 
 
+@pytest.mark.parametrize(
+    ("first", "later", "declared", "expected"),
+    [
+        ("01.06.2026 08:00:00", "01.06.2026 08:00:01", {}, "2026-06-01"),
+        ("1/6/2026 8:00", "13/6/2026 8:00", {}, "2026-06-01"),
+        ("06/01/2026 8:00 AM", "06/13/2026 8:00 PM", {}, "2026-06-01"),
+        ("01/06/2026 08:00", "02/06/2026 08:00", {"day_first": True}, "2026-06-01"),
+        ("01/06/2026 08:00", "02/06/2026 08:00", {"day_first": False}, "2026-01-06"),
+        ("2026/06/01 08:00", "2026/06/02 08:00", {}, "2026-06-01"),
+    ],
+)
+def test_local_dates(first: str, later: str, declared: dict[str, bool], expected: str) -> None:
+    text = f"time;lon;lat\n{first};8.5;49.1\n{later};8.5001;49.1\n"
+    track, _report = read(text, clock=LogClock(utc_offset_s=7200, **declared))
+    assert datetime.fromtimestamp(track.time_s[0], UTC).isoformat() == f"{expected}T06:00:00+00:00"
+
+
+@pytest.mark.parametrize("later", ["02/06/2026 08:00", "13/06/2026 08:00\n06/14/2026 08:00"])
+def test_dates_whose_order_is_not_known_are_refused(later: str) -> None:
+    rows = "".join(f"{at};8.5;49.1\n" for at in ("01/06/2026 08:00", *later.split("\n")))
+    with pytest.raises(InvalidParameter, match="day or the month") as caught:
+        read("time;lon;lat\n" + rows)
+    assert caught.value.field == "poses.clock.day_first"
+    assert "2026" in caught.value.message
+
+
+def test_texts_that_are_no_times_are_shown() -> None:
+    with pytest.raises(UnreadableUpload, match=r"'Montag um acht' is no time .* 2026-06-01T08:00:00Z"):
+        read("time;lon;lat\nMontag um acht;8.5;49.1\n")
+
+
 # --- GPX ----------------------------------------------------------------------------------------------------------
 
 
@@ -205,6 +236,108 @@ def test_headings_and_accuracies() -> None:
     assert (track.time_s - AT_S).tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(track.heading_deg, [91.5, 80.0, np.nan, 359.0])
     assert track.accuracy_m[0] == pytest.approx(np.hypot(0.03, 0.04) / np.sqrt(2))
+
+
+def headed(*order: str, headings: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0)) -> list[str]:
+    """Sentences of epochs a second apart, each in this order; the vehicle turns where it stands."""
+    sentences = []
+    for second, heading in enumerate(headings):
+        at = f"13393{2 + second}.00"
+        kinds = {
+            "HDT": f"GNHDT,{heading:.1f},T",
+            "RMC": rmc(at).replace("022.4", "000.1"),
+            "GGA": gga(at),
+            "GST": f"GNGST,{at},1,,,,0.03,0.04,0.05",
+            "GSA": "GNGSA,A,3,1,,,,,,,,,,,,1,1,1",
+        }
+        sentences += [kinds[kind] for kind in order]
+    return sentences
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        ("HDT", "RMC", "GGA", "GST"),
+        ("HDT", "RMC"),
+        ("RMC", "HDT"),
+        ("RMC", "GGA", "GST", "HDT"),
+        ("RMC", "HDT", "GGA"),
+        ("GGA", "HDT", "RMC"),
+        ("GSA", "RMC", "HDT"),
+        ("GSA", "HDT", "RMC", "GGA"),
+    ],
+)
+def test_a_heading_belongs_to_its_epoch(order: tuple[str, ...]) -> None:
+    track, report = read(nmea(*headed(*order)))
+    assert (track.time_s - AT_S).tolist() == [0, 1, 2, 3]
+    assert track.heading_deg.tolist() == [0, 30, 60, 90]
+    assert not report.warnings
+
+
+def test_where_an_epoch_begins_is_not_guessed_silently() -> None:
+    both = nmea("GNHDT,330.0,T", *headed("RMC", "HDT"))
+    neither = nmea(*headed("HDT", "RMC")[1:])
+    for text, expected in ((both, [0, 30, 60, 90]), (neither, [30, 60, 90, np.nan])):
+        track, report = read(text)
+        np.testing.assert_array_equal(track.heading_deg, expected)
+        assert any("HDT sentences have no time" in text for text in report.warnings)
+    steady = nmea("GNHDT,90.0,T", *headed("RMC", "HDT", headings=(90.0, 90.5, 91.0)))
+    assert not read(steady)[1].warnings
+    # the first line is cut: the log began within an epoch, which its first heading ends
+    torn, report = read("0.6,250.0,M,-33.0,M,,*5B\r\n" + nmea("GNHDT,330.0,T", *headed("RMC", "HDT")))
+    assert torn.heading_deg.tolist() == [0, 30, 60, 90]
+
+
+def test_a_lost_sentence_moves_no_heading() -> None:
+    lines = headed("RMC", "HDT", "GGA", headings=(0.0, 30.0, 60.0, 90.0, 120.0))
+    del lines[8]  # GGA of the third epoch
+    track, _report = read(nmea(*lines))
+    np.testing.assert_array_equal(track.heading_deg, [0, 30, np.nan, 90, 120])
+
+
+@pytest.mark.parametrize(
+    ("sentence", "estimated"),
+    [
+        (rmc("133932.00").removesuffix("A") + "E", True),
+        (gga("133932.00", 6), True),
+        ("GNGLL,4217.00740,N,08536.74074,W,133932.00,A,E", True),
+        ("GNGNS,133932.00,4217.00740,N,08536.74074,W,EE,12,0.6,250.0,-33.0,,", True),
+        ("GNGNS,133932.00,4217.00740,N,08536.74074,W,AE,12,0.6,250.0,-33.0,,", False),
+        ("GNVTG,80.0,T,,M,5.5,N,10.2,K,E", True),
+        ("GNVTG,80.0,T,,M,5.5,N,10.2,K,A", False),
+        (gga("133932.00", 4), False),
+    ],
+)
+def test_dead_reckoning_is_warned_of(sentence: str, estimated: bool) -> None:
+    for text in (
+        nmea(rmc("133932.00"), sentence),
+        nmea("GNZDA,133932.00,16,03,2026,00,00", sentence, rmc("133933.00")),
+    ):
+        track, report = read(text)
+        assert len(track.time_s)
+        assert any("dead reckoning" in warning for warning in report.warnings) is estimated
+
+
+def test_leap_seconds() -> None:
+    midnight_s = datetime(2017, 1, 1, tzinfo=UTC).timestamp()
+    track, _report = read(nmea(rmc("235959.00", "311216"), rmc("235960.00", "311216"), rmc("000001.00", "010117")))
+    assert (track.time_s - midnight_s).tolist() == [-1, 0, 1]
+    track, _report = read(nmea(gga("235960.50"), gga("000001.50"), rmc("000002.50", "010117")))
+    assert (track.time_s - midnight_s).tolist() == [0.5, 1.5, 2.5]
+    for written in ("2016-12-31T23:59:60Z", "2016-12-31T23:59:60.000Z", "2017-01-01T08:59:60+09:00"):
+        track, _report = read(GPX.format(POINT.replace("2026-03-16T13:39:32Z", written).format("")))
+        assert track.time_s.tolist() == [midnight_s]
+        assert read(CSV.replace("2026-03-16T13:39:32Z", written))[0].time_s[0] == midnight_s
+
+
+def test_dates_before_2000_name_the_week_rollover() -> None:
+    # 1024 and 2048 weeks before 2018 and 2026
+    for day, weeks, true in (("310798", 1024, datetime(2018, 3, 16)), ("310787", 2048, datetime(2026, 10, 30))):
+        text = nmea(rmc("133932.00", day))
+        with pytest.raises(UnreadableUpload, match="rollover of the GPS week counter"):
+            read(text)
+        track, _report = read(text, clock=LogClock(offset_s=weeks * 7 * 86_400.0))
+        assert datetime.fromtimestamp(track.time_s[0], UTC).date() == true.date()
 
 
 def test_checksums_and_voids() -> None:

@@ -175,6 +175,178 @@ def test_values_that_say_no_value_are_left_out(tmp_path: Path) -> None:
     assert ("speed-invalid", 3) in [(e.what, e.count) for e in result.report.left_out]
 
 
+# --- channels, identifiers and times as the files of other programs write them ------------------------------------
+
+
+SIGNAL = CanSignal(arbitration_id=0x123, length=16, factor=0.01, unit="km/h")
+ASC_HEAD = "date Thu May 16 06:16:50.884 pm 2024\nbase hex  timestamps {}\ninternal events logged\n"
+SAVVYCAN = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+
+
+def frame(t_s: float, speed_km_h: float, number: int = 0x123, *, extended: bool = False, channel: Any = 0) -> Any:
+    """A frame with a speed in its first two bytes."""
+    data = round(100 * speed_km_h).to_bytes(2, "little") + bytes(6)
+    return can.Message(timestamp=t_s, arbitration_id=number, data=data, is_extended_id=extended, channel=channel)
+
+
+def written(frames: list[Any], suffix: str, folder: Path) -> bytes:
+    """A log by python-can."""
+    path = folder / f"frames.{suffix}"
+    with can.Logger(path) as writer:
+        for one in frames:
+            writer.on_message_received(one)
+    return path.read_bytes()
+
+
+def read_km_h(
+    content: str | bytes, name: str = "drive.log", dbc: bytes | None = None, signal: CanSignal = SIGNAL, **can_log: Any
+) -> tuple[list[float], TraceFile]:
+    """Speeds of a log beside a recording of two seconds."""
+    trace = make_trace(800)
+    parts = {} if dbc is None else {"car.dbc": dbc}
+    data = content.encode() if isinstance(content, str) else content
+    found = read(trace, name, data, declared(speed=signal, heading=None, **can_log), **parts)
+    return [round(3.6 * float(v), 2) for v in found.trace.speed_m_s], found
+
+
+def refused_log(content: str | bytes, name: str = "drive.log", **changes: Any) -> InvalidParameter | UnsupportedUpload:
+    with pytest.raises((InvalidParameter, UnsupportedUpload)) as error:
+        read_km_h(content, name, **changes)
+    assert error.value.cure
+    return error.value
+
+
+@pytest.mark.parametrize(
+    ("suffix", "channels", "declared_channel"),
+    [
+        ("asc", (0, 1), 1),
+        ("blf", (0, 1), 1),
+        ("trc", (0, 1), 1),
+        ("log", ("can0", "vcan1"), "can0"),
+    ],
+)
+def test_channels_are_those_of_the_file(
+    suffix: str, channels: tuple[Any, Any], declared_channel: int | str, tmp_path: Path
+) -> None:
+    frames = [
+        frame(EPOCH_S + 0.1 * i, speed, channel=channel)
+        for i in range(1, 20)
+        for channel, speed in zip(channels, (50.0, 90.0), strict=True)
+    ]
+    content = written(frames, suffix, tmp_path)
+    assert set(read_km_h(content, f"drive.{suffix}", channel=declared_channel)[0]) == {50.0}
+    shown = refused_log(content, f"drive.{suffix}", channel="9")
+    assert shown.field == "can.channel"
+    assert str(declared_channel) in str(shown.limit)
+    assert "several channels" in refused_log(content, f"drive.{suffix}").message
+
+
+def test_a_log_without_channels_has_none_to_declare(tmp_path: Path) -> None:
+    content = written([frame(EPOCH_S + 0.1 * i, 50) for i in range(20)], "csv", tmp_path)
+    assert set(read_km_h(content, "drive.csv")[0]) == {50.0}
+    assert "does not write channels" in refused_log(content, "drive.csv", channel=1).message
+
+
+@pytest.mark.parametrize("suffix", ["asc", "blf", "trc", "log", "csv"])
+def test_identifiers_of_11_and_29_bits_are_others(suffix: str, tmp_path: Path) -> None:
+    frames = [frame(EPOCH_S + 0.1 * i + 0.05 * e, 50 + 40 * e, extended=bool(e)) for i in range(1, 20) for e in (0, 1)]
+    content = written(frames, suffix, tmp_path)
+    name = f"drive.{suffix}"
+    assert set(read_km_h(content, name)[0]) == {50.0}
+    assert set(read_km_h(content, name, signal=SIGNAL.model_copy(update={"extended": True}))[0]) == {90.0}
+    only_long = written(frames[1::2], suffix, tmp_path)
+    speeds, found = read_km_h(only_long, name)
+    assert set(speeds) == {90.0}
+    assert any("29-bit identifier" in text for text in found.report.warnings)
+    error = refused_log(only_long, name, signal=SIGNAL.model_copy(update={"extended": False}))
+    assert "0x00000123" in error.message
+    with pytest.raises(ValidationError):
+        CanSignal(arbitration_id=0x800, extended=False)
+
+
+def test_a_dbc_marks_identifiers_of_29_bits(tmp_path: Path) -> None:
+    frames = [frame(EPOCH_S + 0.1 * i + 0.05 * e, 50 + 40 * e, extended=bool(e)) for i in range(1, 20) for e in (0, 1)]
+    content = written(frames, "log", tmp_path)
+    by_name = CanSignal(name="Speed")
+    for number, speed in ((0x123, 50.0), (0x80000123, 90.0)):
+        dbc = f'VERSION ""\nBU_: E\nBO_ {number} V: 8 E\n SG_ Speed : 0|16@1+ (0.01,0) [0|300] "km/h" E\n'
+        assert set(read_km_h(content, dbc=dbc.encode(), signal=by_name)[0]) == {speed}
+
+
+def test_j1939_messages_of_any_source(tmp_path: Path) -> None:
+    # CCVS is parameter group 65265; the DBC leaves the source open by the null address 254
+    dbc = f'VERSION ""\nBU_: E\nBO_ {0x98FEF1FE} CCVS: 8 E\n SG_ Speed : 0|16@1+ (0.01,0) [0|300] "km/h" E\n'.encode()
+    by_name = CanSignal(name="Speed")
+    one = [frame(EPOCH_S + 0.1 * i, 50, 0x18FEF100, extended=True) for i in range(1, 20)]
+    other = [frame(m.timestamp + 0.01, 90, 0x18FEF121, extended=True) for m in one]
+    unrelated = [frame(m.timestamp + 0.02, 70, 0x18FEF200, extended=True) for m in one]
+    speeds, _found = read_km_h(written([*one, *unrelated], "log", tmp_path), dbc=dbc, signal=by_name)
+    assert set(speeds) == {50.0}
+    both = written([*one, *other], "log", tmp_path)
+    error = refused_log(both, dbc=dbc, signal=by_name)
+    assert "0x18FEF100, 0x18FEF121" in error.message
+    assert error.field == "can.speed.arbitration_id"
+    chosen = CanSignal(name="Speed", arbitration_id=0x18FEF121)
+    assert set(read_km_h(both, dbc=dbc, signal=chosen)[0]) == {90.0}
+
+
+def test_asc_times_that_are_intervals() -> None:
+    # every line counts, also those that hold no frame
+    lines = "   0.000000 Start of measurement\n" + "".join(
+        "   0.060000 1  123             Rx   d 8 88 13 00 00 00 00 00 00\n   0.040000 1  Statistic: D 0 R 0\n"
+        for _ in range(20)
+    )
+    speeds, found = read_km_h(ASC_HEAD.format("relative") + lines, "drive.asc")
+    assert set(speeds) == {50.0}
+    assert np.allclose(np.diff(found.trace.speed_t_s), 0.1)
+    assert len(found.trace.speed_t_s) == 20
+    trigger = "Begin Triggerblock Thu May 16 06:16:50.884 pm 2024\n"
+    twice = ASC_HEAD.format("relative") + 2 * (trigger + lines + "End TriggerBlock\n")
+    assert "trigger blocks" in refused_log(twice, "drive.asc").message
+
+
+@pytest.mark.parametrize("stamp", ["", "(1716000000.{i:06d})  ", "(000.{i:06d})  ", "(2024-05-18 02:40:00.{i:06d})  "])
+@pytest.mark.parametrize("name", ["drive.log", "drive.txt"])
+@pytest.mark.parametrize(
+    "line", ["{}can0  123   [8]  88 13 00 00 00 00 00 00", " {}vcan1  RX - -  00000123  [08]  88 13"]
+)
+def test_what_candump_shows_on_a_console_is_refused_by_name(stamp: str, name: str, line: str) -> None:
+    text = "".join(" " + line.format(stamp.format(i=i)) + "\n" for i in range(20))
+    error = refused_log(text, name)
+    assert "candump shows on a console" in error.message
+    assert "candump -l" in str(error.cure)
+
+
+def test_candumps_log_under_any_name(tmp_path: Path) -> None:
+    content = written([frame(EPOCH_S + 0.1 * i, 50) for i in range(20)], "log", tmp_path)
+    assert set(read_km_h(content, "drive.txt")[0]) == {50.0}
+
+
+def test_savvycan() -> None:
+    rows = "".join(
+        f"{1_000_000 + 100_000 * i},00000123,false,Rx,{bus},8,{low},13,00,00,00,00,00,00,\n"
+        for i in range(20)
+        for bus, low in ((0, "88"), (1, "00"))
+    )
+    broken = "-5,00000123,false,Rx,0,8,FF,FF,00,00,00,00,00,00,\n"
+    speeds, found = read_km_h(SAVVYCAN + broken + rows, "drive.csv", channel=0)
+    assert found.report.formats["drive.csv"] is TraceFormat.CAN
+    assert set(speeds) == {50.0}
+    assert np.allclose(np.diff(found.trace.speed_t_s), 0.1)
+    assert ("frames-before-zero", 1) in [(left.what, left.count) for left in found.report.left_out]
+    older = (SAVVYCAN + rows).replace("Dir,", "").replace("Rx,", "")
+    assert set(read_km_h(older, "drive.csv", channel=1)[0]) == {48.64}
+
+
+def test_asc_frames_before_the_trigger_are_reported() -> None:
+    lines = "".join(
+        f"   {t:.6f} 1  123             Rx   d 8 88 13 00 00 00 00 00 00\n" for t in np.arange(-0.3, 1.6, 0.1)
+    )
+    speeds, found = read_km_h(ASC_HEAD.format("absolute") + lines, "drive.asc")
+    assert len(speeds) == 16
+    assert [left.count for left in found.report.left_out if left.what == "frames-before-zero"] == [3]
+
+
 def test_bad_declarations(tmp_path: Path) -> None:
     trace = make_trace(400)
     content = log(trace, "log", tmp_path)
