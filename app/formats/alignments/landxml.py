@@ -222,7 +222,7 @@ def _curve(shape: ET.Element, scale: _Scale, place: str, warnings: list[str]) ->
         shapes.append(_READERS[child.tag](child, start, end, scale, where, warnings))
         s += sum(piece.length for piece, _stop in shapes[-1].sides[0])
     if empty:
-        warnings.append(f"{place}: {empty} elements of zero length are left out.")
+        warnings.append(f"{place}: elements of zero length that are left out: {empty}.")
     if not shapes:
         return None
     _choose_sides(shapes, place, warnings)

@@ -242,7 +242,7 @@ def test_elements_without_length_are_left_out() -> None:
     file = read_alignment(landxml(shape))
     assert stations(file)[-1] == pytest.approx(200.0)
     assert curvatures(file).tolist() == [0.0] * len(curvatures(file))
-    assert file.warnings == ("alignment CL: 4 elements of zero length are left out.",)
+    assert file.warnings == ("alignment CL: elements of zero length that are left out: 4.",)
     circle = f'<Curve rot="cw" radius="10" length="62.83">{ends((0, 0), (0, 0))}<Center>10 0</Center></Curve>'
     with pytest.raises(UnreadableUpload, match="no arc of radius 10 joins"):
         read_alignment(landxml(circle))
