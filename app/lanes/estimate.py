@@ -83,6 +83,8 @@ _CONTRADICTED = (
 _MIN_CONTRADICTED = 2  # a single marker may have been moved
 _MIN_FIXES = 10  # of the track in the lane to which the vehicle changed
 _MAX_GAP_M = 25.0  # [m] without a marker of the driven lane, beside markers of others; two spacings
+_MIN_SHARE, _LONG_M = 0.25, 100.0  # of the drive past markers, that a path covers which is not that long [m]
+_MIN_OWN_SHARE = 0.15  # of the markers that were received; two of the eight lines of a motorway are a quarter
 _MAX_ACROSS_M = 1.6  # [m] that an accurate track moves across its lane; half of a lane
 _MAX_WITHIN = 2  # markers between the boundaries of a path: of a road that crosses, or spoofed
 _WITHIN_MARGIN_M = 0.6  # [m] from a boundary; `LaneDeclaration.off_the_line_m`
@@ -437,6 +439,9 @@ def _fit_driven_lane(
     if _markers_within(lane, observations.point_m[taken], half) > _MAX_WITHIN:
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
     if not drive.accuracy_m < TRUSTED_TRACK_M and _widest_gap_m(lane, observations) > _MAX_GAP_M:
+        return refused_path(observations, notes, _NOT_ALONG, "waymark")
+    crosses = float(np.ptp(lane.station_m)) < min(_MIN_SHARE * float(np.ptp(along[taken])), _LONG_M)
+    if crosses or (lane.side != UNKNOWN).sum() < _MIN_OWN_SHARE * taken.sum():
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
     stretches = _stretches(lane, course, drive) if course.lane.any() else ()
     beside = tuple(
