@@ -1,7 +1,7 @@
 """``python -m benchmarks.fuzz [ITEM ...] [--seconds N] [--short]``: print what was tried and what survived.
 
-Items: the names of parsers, `parsers` for all of them, `frames` for damaged pictures in the decoder processes,
-`registry` for the registry beside a model. The exit status is 1 where something failed; its smallest input is printed.
+Items: the names of parsers, `parsers` for all of them, `grammar` for valid files whose content is compared, `frames`
+for damaged pictures in the decoder processes, `registry` for the registry beside a model. The exit status is 1 where something failed; its smallest input is printed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 
 from benchmarks.fuzz.frames import attack_frames
+from benchmarks.fuzz.grammar import GRAMMARS, compare
 from benchmarks.fuzz.parsers import attack, list_parsers
 from benchmarks.fuzz.registry_model import compare_with_model
 
@@ -17,14 +18,15 @@ def main() -> int:
     """Run the items; 1 where one failed."""
     parsers = {parser.name: parser for parser in list_parsers()}
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=__doc__)
-    parser.add_argument("items", nargs="*", default=["parsers", "frames", "registry"])
+    parser.add_argument("items", nargs="*", default=["parsers", "grammar", "frames", "registry"])
+    parser.add_argument("--files", type=int, default=10_000, help="of each grammar")
     parser.add_argument("--seconds", type=float, default=600.0, help="for each parser")
     parser.add_argument("--mutations", type=int, default=100_000, help="of pictures")
     parser.add_argument("--runs", type=int, default=2000, help="of the registry, of 50 steps each, on each database")
     parser.add_argument("--short", action="store_true", help="two seconds for each parser, 500 pictures, 10 runs")
     args = parser.parse_args()
     if args.short:
-        args.seconds, args.mutations, args.runs = 2.0, 500, 10
+        args.seconds, args.mutations, args.runs, args.files = 2.0, 500, 10, 100
     failures: list[str] = []
     print(f"### fuzz\n\n{'Short' if args.short else 'Long'} mode.\n")
     print("| input | tried | accepted | refused | slowest [CPU s] | failed |\n|---|--:|--:|--:|--:|--:|")
@@ -33,6 +35,11 @@ def main() -> int:
             found = attack(one, seconds=args.seconds)
             _print(name, found.tried, found.accepted, found.refused.total(), found.slowest_s, found.failures)
             failures += found.failures
+    for name in GRAMMARS if "grammar" in args.items else ():
+        compared = compare(name, args.files)
+        read = compared.tried - compared.refused
+        _print(f"{name}, valid", compared.tried, read, compared.refused, 0.0, compared.failures)
+        failures += compared.failures
     if "frames" in args.items:
         pictures = attack_frames(args.mutations)
         refused = pictures.refused.total()

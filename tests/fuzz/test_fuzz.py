@@ -7,6 +7,7 @@ import json
 import pytest
 
 from benchmarks.fuzz.frames import attack_frames
+from benchmarks.fuzz.grammar import GRAMMARS, compare
 from benchmarks.fuzz.parsers import Parser, attack, list_parsers
 
 PARSERS = list_parsers()
@@ -19,6 +20,13 @@ def test_damaged_files_are_read_or_refused(parser: Parser) -> None:
     assert not outcome.failures, outcome.failures[0]
     assert outcome.accepted
     assert outcome.refused or parser.name in ("kinds", "archives")  # these two answer with what they found
+
+
+@pytest.mark.parametrize("grammar", GRAMMARS)
+def test_the_content_of_valid_files_is_read(grammar: str) -> None:
+    found = compare(grammar, 120)
+    assert not found.failures, found.failures[0]
+    assert not found.refused
 
 
 def test_an_error_of_no_domain_is_found() -> None:
