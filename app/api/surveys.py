@@ -160,7 +160,7 @@ def _refused(request: Request, report: ImportReport) -> Response:
 
 export_router = Router("/v1/exports", "exports")
 
-ExportFormat = Literal["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"]
+ExportFormat = Literal["csv", "geojson", "gpkg", "geoparquet", "flatgeobuf", "shapefile", "kml", "landxml", "dxf"]
 _Measure = Annotated[float, Field(strict=True, ge=-1e8, le=1e8, allow_inf_nan=False)]
 Exports = Annotated[ExportsService, use_case(lambda cases: cases.exports)]
 

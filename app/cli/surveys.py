@@ -74,7 +74,10 @@ def import_survey(
 def export_markers(
     out: Annotated[Path, typer.Argument(dir_okay=False, help="File to write; it must not exist.")],
     agency: Annotated[str, typer.Option(help="Name of the agency that owns the markers.")],
-    kind: Annotated[str, typer.Option("--format", help="csv, geojson, gpkg, shapefile, kml, landxml or dxf.")] = "gpkg",
+    kind: Annotated[
+        str,
+        typer.Option("--format", help="csv, geojson, gpkg, geoparquet, flatgeobuf, shapefile, kml, landxml or dxf."),
+    ] = "gpkg",
     bbox: Annotated[str | None, typer.Option(help="Only markers in west,south,east,north. [deg]")] = None,
     status: Annotated[str | None, typer.Option(help="Only markers with this status.")] = None,
     family: Annotated[

@@ -157,6 +157,7 @@ _DXF_VALUES = (*map(str, _DXF_PLACE), "<CODE>", "<ID>", "<HEIGHT>")
 """What stands in the reference that is repeated, in the place of a marker's position and texts."""
 _DXF_SECTION_END = "  0\nENDSEC\n"
 _GIS_PAGE = 50_000
+_BOX = ("xmin", "ymin", "xmax", "ymax")
 
 
 class _Zone(NamedTuple):
@@ -239,7 +240,7 @@ def write_file(kind: str, pages: Iterable[Sequence[Record]], folder: Path, *, al
     Parameters
     ----------
     kind : str
-        ``gpkg``, ``shapefile``, ``kml``, ``landxml`` or ``dxf``.
+        ``gpkg``, ``geoparquet``, ``flatgeobuf``, ``shapefile``, ``kml``, ``landxml`` or ``dxf``.
     pages : iterable of sequences of mapping
         At least one page, with at least one record.
     all_heights : bool
@@ -251,54 +252,124 @@ def write_file(kind: str, pages: Iterable[Sequence[Record]], folder: Path, *, al
         with path.open("wb") as file:
             return WrittenFile(path, write(list(chain.from_iterable(pages)), file))
     records = chain.from_iterable(pages)
-    first = iter(lambda: list(islice(records, None if kind == "kml" else _GIS_PAGE)), [])
-    return write_gis(first, kind, folder, all_heights=all_heights)
+    steps = iter(lambda: list(islice(records, None if kind == "kml" else _GIS_PAGE)), [])
+    if kind == "geoparquet":
+        return write_geoparquet(steps, folder / "markers.parquet")
+    return write_gis(steps, kind, folder, all_heights=all_heights)
 
 
 def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, all_heights: bool) -> WrittenFile:
-    """A GeoPackage, a zipped Shapefile (names of `SHAPEFILE_NAMES`) or KML in a folder, by GDAL, a page at a time.
+    """A GeoPackage, FlatGeobuf, a zipped Shapefile (names of `SHAPEFILE_NAMES`) or KML in a folder, by GDAL, a page at
+    a time.
 
     Parameters
     ----------
     pages : iterable of sequences of mapping
         At least one page; of KML, exactly one.
     driver : str
-        ``gpkg``, ``shapefile`` or ``kml``.
+        ``gpkg``, ``flatgeobuf``, ``shapefile`` or ``kml``.
     folder : Path
         An empty one.
     all_heights : bool
-        Whether every marker has an ellipsoidal height. The points of a Shapefile all have one or none; those of a
-        GeoPackage have it where it is known. KML has none: it takes them to be above the geoid.
+        Whether every marker has a height that its geometry can have. The points of a Shapefile or of FlatGeobuf all
+        have one or none; those of a GeoPackage have it where it is known. KML has none: it takes them to be above the
+        geoid.
     """
     from pyogrio import raw  # type: ignore[import-untyped]  # 50 MB that most servers never need
 
-    name, suffix = {"gpkg": ("GPKG", "gpkg"), "shapefile": ("ESRI Shapefile", "shp"), "kml": ("KML", "kml")}[driver]
+    table = "gpkg" if driver == "flatgeobuf" else driver  # FlatGeobuf cannot be appended to
+    name, suffix = {"gpkg": ("GPKG", "gpkg"), "shapefile": ("ESRI Shapefile", "shp"), "kml": ("KML", "kml")}[table]
     path, left_out, written = folder / f"markers.{suffix}", list[str](), 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # KML has a name of its own for some fields
         for whole in pages:
-            page = [record for record in whole if _place(record)[0] is not None]
-            left_out += [str(record["id"]) for record in whole if _place(record)[0] is None]
+            page = _with_place(whole, left_out)
             if not page:
                 continue
-            is_framed = _is_framed(page[0])
-            texts = (*TEXTS, *FRAME_TEXTS) if is_framed else TEXTS
-            numbers = (*NUMBERS, *FRAME_NUMBERS) if is_framed else NUMBERS
-            crs = page[0]["geometry_crs"] if is_framed else "EPSG:4326"
-            all_heights = all_heights or is_framed  # the z of a Shapefile is NaN where there is none
+            texts, numbers, crs = _columns_of(page[0])
             fields = (*texts, *numbers)
             names = [SHAPEFILE_NAMES[n] for n in fields] if driver == "shapefile" else list(fields)
             # GDAL adds z to a GeoPackage's geometry as it comes
-            kind = "Point Z" if all_heights and driver == "shapefile" else "Point"
-            geometry, columns = _gis_columns(page, texts, numbers, flat=kind == "Point" and driver != "gpkg")
+            kind = "Point Z" if all_heights and driver in ("shapefile", "flatgeobuf") else "Point"
+            points, columns = _gis_columns(page, texts, numbers, flat=kind == "Point" and driver != "gpkg")
             raw.write(
-                path, geometry, columns, names, driver=name, geometry_type=kind, crs=crs,
+                path, shapely.to_wkb(points), columns, names, driver=name, geometry_type=kind, crs=crs,
                 layer="markers", encoding="UTF-8", append=written > 0,
             )  # fmt: skip
             written += len(page)
-    if not written:
-        raise _none_in_area()
+        if not written:
+            raise _none_in_area()
+        if driver == "flatgeobuf":
+            layer, path = path, folder / "markers.fgb"
+            with raw.open_arrow(layer, use_pyarrow=False) as (meta, rows):
+                raw.write_arrow(
+                    rows, path, driver="FlatGeobuf", layer="markers", geometry_type=kind, crs=crs,
+                    geometry_name=meta["geometry_name"],
+                )  # fmt: skip
+            layer.unlink()
     return WrittenFile(_zipped(folder) if driver == "shapefile" else path, tuple(left_out))
+
+
+def write_geoparquet(pages: Iterable[Sequence[Record]], path: Path) -> WrittenFile:
+    """GeoParquet 1.1, a row group a page: points with z where it is known, and their boxes in the column `bbox`.
+
+    The file states an epoch if it is that of all markers. Needs the extra `parquet`.
+    """
+    import pyarrow as pa
+    from pyarrow.parquet import ParquetWriter
+
+    remaining = iter(pages)
+    first = next(remaining)
+    texts, numbers, crs = _columns_of(first[0])
+    types = {**dict.fromkeys(texts, pa.string()), **dict.fromkeys(numbers, pa.float64())}
+    types |= {"bbox": pa.struct([(name, pa.float64()) for name in _BOX]), "geometry": pa.binary()}
+    schema = pa.schema(list(types.items()))
+    left_out, bounds = list[str](), list[Floats]()
+    shapes, epochs = set[str](), set[float | None]()
+    with ParquetWriter(path, schema, compression="zstd") as writer:
+        for whole in chain([first], remaining):
+            page = _with_place(whole, left_out)
+            if not page:
+                continue
+            points, columns = _gis_columns(page, texts, numbers, flat=False)
+            place = shapely.get_coordinates(points, include_z=True)
+            x, y = (pa.array(place[:, axis]) for axis in (0, 1))
+            arrays = {
+                name: pa.array(values, types[name], from_pandas=True)  # NaN is null
+                for name, values in zip((*texts, *numbers), columns, strict=True)
+            }
+            arrays["bbox"] = pa.StructArray.from_arrays([x, y, x, y], names=_BOX)
+            arrays["geometry"] = pa.array(shapely.to_wkb(points, flavor="iso"), pa.binary())
+            writer.write_table(pa.table(arrays, schema=schema))
+            bounds += [np.fmin.reduce(place), np.fmax.reduce(place)]
+            shapes.update(np.where(shapely.has_z(points), "Point Z", "Point").tolist())
+            epochs.update(record["geometry_epoch" if _is_framed(record) else "epoch"] for record in page)
+        if not bounds:
+            raise _none_in_area()
+        axes = 3 if "Point Z" in shapes else 2
+        geometry: JsonObject = {
+            "encoding": "WKB", "geometry_types": sorted(shapes), "crs": reference_system(crs).to_json_dict(),
+            "edges": "planar", "covering": {"bbox": {name: ["bbox", name] for name in _BOX}},
+            "bbox": [*np.fmin.reduce(bounds)[:axes].tolist(), *np.fmax.reduce(bounds)[:axes].tolist()],
+        }  # fmt: skip
+        if len(epochs) == 1 and (epoch := epochs.pop()) is not None:
+            geometry["epoch"] = epoch
+        geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": geometry}}
+        writer.add_key_value_metadata({"geo": orjson.dumps(geo).decode()})
+    return WrittenFile(path, tuple(left_out))
+
+
+def _with_place(records: Sequence[Record], left_out: list[str]) -> list[Record]:
+    """The records that have a place; the ids of the others are added to `left_out`."""
+    left_out += [str(record["id"]) for record in records if _place(record)[0] is None]
+    return [record for record in records if _place(record)[0] is not None]
+
+
+def _columns_of(record: Record) -> tuple[Sequence[str], Sequence[str], str]:
+    """Texts and numbers of a file of such records, and the system of its geometry."""
+    if _is_framed(record):
+        return (*TEXTS, *FRAME_TEXTS), (*NUMBERS, *FRAME_NUMBERS), record["geometry_crs"]
+    return TEXTS, NUMBERS, "EPSG:4326"
 
 
 def _none_in_area() -> InvalidParameter:
@@ -312,8 +383,8 @@ def _none_in_area() -> InvalidParameter:
 
 def _gis_columns(
     page: Sequence[Record], texts: Sequence[str], numbers: Sequence[str], *, flat: bool
-) -> tuple[object, list[Any]]:
-    """Points as WKB, and the columns."""
+) -> tuple[npt.NDArray[np.object_], list[Any]]:
+    """Points, and the columns."""
     values = list(zip(*(record.values() for record in page), strict=True))
     of = dict(zip(page[0], values, strict=True))
     columns = [np.array(of[n], dtype=object) for n in texts]
@@ -323,7 +394,7 @@ def _gis_columns(
     if not flat:
         known = np.isfinite(z)
         points[known] = shapely.points(x[known], y[known], z[known])
-    return shapely.to_wkb(points), columns
+    return points, columns
 
 
 def _zipped(folder: Path) -> Path:

@@ -629,9 +629,11 @@ def count_records(
     return int(connection.execute(query.where(markers.c.agency_id == agency_id, *conditions_of(filtered))).scalar_one())
 
 
-def have_ellipsoidal_heights(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> bool:
-    """Whether every marker of the filter has an ellipsoidal height."""
-    lacks = sa.or_(markers.c.height_m.is_(None), markers.c.vertical_datum != ELLIPSOID)
+def have_heights(connection: sa.Connection, agency_id: str, filtered: MarkerFilter, *, ellipsoidal: bool) -> bool:
+    """Whether every marker of the filter has a height, or an ellipsoidal one."""
+    lacks: sa.ColumnElement[bool] = markers.c.height_m.is_(None)
+    if ellipsoidal:
+        lacks = sa.or_(lacks, markers.c.vertical_datum != ELLIPSOID)
     query = sa.select(markers.c.row).where(markers.c.agency_id == agency_id, lacks, *conditions_of(filtered))
     return connection.execute(query.limit(1)).first() is None
 

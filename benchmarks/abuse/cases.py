@@ -115,7 +115,11 @@ def _queries(*, short: bool) -> Iterator[Case]:
         "all in another CRS": {"limit": "10000", "crs": "http://www.opengis.net/def/crs/EPSG/0/3857"},
     }.items():
         yield Case(f"GET {items}", name, "GET", path, {"params": parameters})
-    for kind in ("csv", "gpkg") if short else ("csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"):
+    for kind in (
+        ("csv", "gpkg")
+        if short
+        else ("csv", "geojson", "gpkg", "geoparquet", "flatgeobuf", "shapefile", "kml", "landxml", "dxf")
+    ):
         yield Case("GET /v1/exports/{kind}", kind, "GET", f"/v1/exports/{kind}", {})
     yield _get("/v1/snapshots", "the world", bbox="-180,-90,180,90")
 

@@ -30,7 +30,7 @@ from benchmarks.registry.servers import drop_database, make_database, settle
 
 ROWS = 200_000
 MAX_CPU_S, MAX_MEMORY_MB, MAX_HEALTH_MS, MAX_AFTER_S = 5.0, 200.0, 250.0, 0.3
-_IN_A_PROCESS, MAX_PROCESS_CPU_S = ("gpkg", "shapefile"), 10.0
+_IN_A_PROCESS, MAX_PROCESS_CPU_S = ("gpkg", "geoparquet", "flatgeobuf", "shapefile"), 10.0
 _TOO_MANY = ("kml", "landxml", "dxf")
 """Files that hold fewer markers than this registry: they are refused, and it must cost next to nothing."""
 LEFT_AFTER_S, IDLE_AFTER_S = 0.3, 1.0
@@ -47,9 +47,7 @@ def _polygon(vertices: int) -> dict[str, object]:
 
 READS: dict[str, tuple[str, object]] = {
     "snapshot": ("/v1/snapshots?bbox=-180,-90,180,90", None),
-    **{
-        kind: (f"/v1/exports/{kind}", None) for kind in ("csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf")
-    },
+    **{kind: (f"/v1/exports/{kind}", None) for kind in ("csv", "geojson", *_IN_A_PROCESS, *_TOO_MANY)},
     "10,000 items, counted": (f"{_ITEMS}limit=10000&count=true", None),
     "10,000 items in another CRS": (
         f"{_ITEMS}{urlencode({'limit': 10000, 'crs': 'http://www.opengis.net/def/crs/EPSG/0/3857'})}",

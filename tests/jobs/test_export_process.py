@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from pyarrow import parquet
 
 from app.errors import ClientLeft, InvalidParameter, ProcessStopped
 from app.formats.exports import FIELDS, Record
@@ -49,6 +50,12 @@ def test_the_process_has_a_limit_of_memory(tmp_path: Path) -> None:
     with pytest.raises(ProcessStopped, match=r"takes too much memory|was stopped") as refused:
         _written_for(iter([[MARKER] * 5_000] * 200), tmp_path, memory_bytes=2**20)
     assert refused.value.field == "bbox"
+
+
+def test_geoparquet_is_written_within_the_memory_of_a_process(tmp_path: Path) -> None:
+    pages = iter([[MARKER] * 5_000] * 24)
+    written = ExportProcesses(1_280_000_000).write("geoparquet", pages, tmp_path, all_heights=False)
+    assert parquet.read_metadata(written.path).num_rows == 120_000
 
 
 def test_an_error_in_the_process_is_raised_here(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import timedelta
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,13 +36,23 @@ from app.values import JsonObject
 STREAMED = {"csv": "text/csv; charset=utf-8", "geojson": "application/geo+json"}
 WHOLE = {
     "gpkg": "application/geopackage+sqlite3",
+    "geoparquet": "application/vnd.apache.parquet",
+    "flatgeobuf": "application/flatgeobuf",
     "shapefile": "application/zip",
     "kml": "application/vnd.google-earth.kml+xml",
     "landxml": "application/xml",
     "dxf": "image/vnd.dxf",
 }
 KINDS = (*STREAMED, *WHOLE)
-MAX_WHOLE = {"gpkg": 10_000_000, "shapefile": 2_000_000, "kml": 200_000, "landxml": 200_000, "dxf": 200_000}
+MAX_WHOLE = {
+    "gpkg": 10_000_000,
+    "geoparquet": 10_000_000,
+    "flatgeobuf": 1_000_000,  # GDAL holds its spatial index in memory
+    "shapefile": 2_000_000,  # 2 GiB of its .dbf
+    "kml": 200_000,  # held in memory, as the next two
+    "landxml": 200_000,
+    "dxf": 200_000,
+}
 _PAGE = 2_000
 _BLOCK = 2**20
 
@@ -88,7 +99,8 @@ class Exports:
         Raises
         ------
         InvalidParameter
-            There are none, or too many for one file, or none has a place in the system.
+            There are none, or too many for one file, or none has a place in the system, or a library of the format is
+            not installed.
         """
         folder = TemporaryDirectory(prefix="waymark-export-")
         try:
@@ -116,10 +128,11 @@ class Exports:
                 pages = _reported(self._pages(caller, filtered, frame), report)
                 file.writelines(write.write_csv(pages, frame) if kind == "csv" else write.write_geojson(pages, frame))
             return WrittenFile(path)
+        _check_installed(kind)
         with_retired = kind not in ("landxml", "dxf") or filtered.status is not None
         with self._database.read() as connection:
             count = markers.count_records(connection, caller.agency_id, filtered, with_retired=with_retired)
-            all_heights = markers.have_ellipsoidal_heights(connection, caller.agency_id, filtered)
+            all_heights = markers.have_heights(connection, caller.agency_id, filtered, ellipsoidal=frame is None)
             if kind in ("landxml", "dxf") and frame is None:
                 frame = _own_frame(markers.origins(connection, caller.agency_id, filtered))
         if kind == "kml" and frame is not None and frame.crs not in ("EPSG:4326", "OGC:CRS84"):
@@ -181,6 +194,16 @@ class Exports:
                 yield page
 
 
+def _check_installed(kind: str) -> None:
+    if kind == "geoparquet" and find_spec("pyarrow") is None:  # not imported: only the process that writes needs it
+        raise InvalidParameter(
+            "this server writes no GeoParquet: pyarrow is not installed",
+            field="format",
+            limit=", ".join(name for name in KINDS if name != kind),
+            cure="export GeoPackage, or ask the operator to install waymark-roads[parquet]",
+        )
+
+
 def _own_frame(origins: Sequence[tuple[str, str | None]]) -> ExportFrame | None:
     """The projected system in which most markers came, with the vertical datum of most heights in it."""
     for crs, _datum in origins:
@@ -211,7 +234,7 @@ def _blocks(path: Path, folder: TemporaryDirectory[str]) -> Iterator[bytes]:
 # === Exports as jobs: the file is written to disk, stored, and sent when it is asked for.
 
 
-SUFFIXES = {"shapefile": "shp.zip", "landxml": "xml"}
+SUFFIXES = {"geoparquet": "parquet", "flatgeobuf": "fgb", "shapefile": "shp.zip", "landxml": "xml"}
 MAX_LEFT_OUT_IDS = 20
 """Ids in the header Waymark-Left-Out. 1 kB."""
 _WRITING = 0.95
@@ -242,6 +265,7 @@ class ExportJobs:
         wanted : mapping
             ``format`` and what `filter_of` and `frame_of` read.
         """
+        _check_installed(wanted["format"])
         filter_of(wanted)
         frame_of(wanted)
         now, agency_id = self._clock(), caller.agency_id

@@ -3766,7 +3766,7 @@ export interface components {
             /** @default null */
             family?: ("plate" | "magnet" | "cerpm" | "fiducial") | null;
             /** @enum {string} */
-            format: "csv" | "geojson" | "gpkg" | "shapefile" | "kml" | "landxml" | "dxf";
+            format: "csv" | "geojson" | "gpkg" | "geoparquet" | "flatgeobuf" | "shapefile" | "kml" | "landxml" | "dxf";
             /** @default null */
             from_m?: number | null;
             /** @default null */
@@ -9392,7 +9392,7 @@ export interface operations {
             };
             header?: never;
             path: {
-                kind: "csv" | "geojson" | "gpkg" | "shapefile" | "kml" | "landxml" | "dxf";
+                kind: "csv" | "geojson" | "gpkg" | "geoparquet" | "flatgeobuf" | "shapefile" | "kml" | "landxml" | "dxf";
             };
             cookie?: never;
         };
@@ -9404,6 +9404,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
+                    "application/flatgeobuf": string;
                     "application/geo+json": {
                         features: {
                             [key: string]: unknown;
@@ -9414,6 +9415,7 @@ export interface operations {
                         [key: string]: unknown;
                     };
                     "application/geopackage+sqlite3": string;
+                    "application/vnd.apache.parquet": string;
                     "application/vnd.google-earth.kml+xml": string;
                     "application/xml": string;
                     "application/zip": string;
@@ -9592,6 +9594,7 @@ export interface operations {
                     [name: string]: unknown;
                 };
                 content: {
+                    "application/flatgeobuf": string;
                     "application/geo+json": {
                         features: {
                             [key: string]: unknown;
@@ -9602,6 +9605,7 @@ export interface operations {
                         [key: string]: unknown;
                     };
                     "application/geopackage+sqlite3": string;
+                    "application/vnd.apache.parquet": string;
                     "application/vnd.google-earth.kml+xml": string;
                     "application/xml": string;
                     "application/zip": string;

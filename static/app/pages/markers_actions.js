@@ -14,7 +14,10 @@ import { t, textOr } from "../texts/index.js";
 
 /** @typedef {import("./markers.js").Marker} Marker */
 
-const EXPORTS = { csv: "csv", geojson: "geojson", gpkg: "gpkg", shapefile: "zip", kml: "kml", landxml: "xml", dxf: "dxf" };
+const EXPORTS = {
+  csv: "csv", geojson: "geojson", gpkg: "gpkg", geoparquet: "parquet", flatgeobuf: "fgb", shapefile: "zip", kml: "kml",
+  landxml: "xml", dxf: "dxf",
+};
 const MAX_ITEMS = 1000; // of POST /v1/markers/bulk
 
 /** @param {{ filters: Record<string, any>, onClose: () => void }} props */

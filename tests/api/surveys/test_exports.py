@@ -7,18 +7,22 @@ import io
 import json
 import re
 import subprocess
+import sys
 import tempfile
 import zipfile
 from pathlib import Path
 
 import ezdxf
 import httpx
+import pyarrow as pa
 import pytest
 import shapely
+from pyarrow import parquet
 from pyogrio import raw, read_info
+from pyproj import CRS
 
 from app.formats import exports as formats
-from app.formats.exports import FIELDS, SHAPEFILE_NAMES, write_csv
+from app.formats.exports import FIELDS, NUMBERS, SHAPEFILE_NAMES, TEXTS, write_csv
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.registry import markers as bulk
@@ -154,7 +158,7 @@ def test_the_filters_are_those_of_the_list(client: httpx.Client, markers: list[d
     assert client.get("/v1/exports/csv", params={"road": "A", "to_m": "nan"}).status_code == 422
 
 
-@pytest.mark.parametrize("kind", ["gpkg", "shapefile"])
+@pytest.mark.parametrize("kind", ["gpkg", "flatgeobuf", "shapefile"])
 def test_files_of_several_pages_hold_every_value(
     server: LiveServer, client: httpx.Client, markers: list[dict[str, float]], kind: str,
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
@@ -166,25 +170,95 @@ def test_files_of_several_pages_hold_every_value(
     )  # other processes have another _GIS_PAGE
     low = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": -1e-9}, "road": "Straße =1"}
     assert client.post("/v1/markers", json=low).status_code == 201
-    path = tmp_path / ("markers.gpkg" if kind == "gpkg" else "markers.zip")
+    path = tmp_path / {"gpkg": "markers.gpkg", "flatgeobuf": "markers.fgb", "shapefile": "markers.zip"}[kind]
     path.write_bytes(client.get(f"/v1/exports/{kind}").content)
     meta, _, geometry, fields = raw.read(path)
     names = {name: SHAPEFILE_NAMES[name] if kind == "shapefile" else name for name in FIELDS}
-    of = {name: fields[list(meta["fields"]).index(given)].tolist() for name, given in names.items()}
+    order = fields[list(meta["fields"]).index("code")].argsort()  # FlatGeobuf is in the order of its spatial index
+    of = {name: fields[list(meta["fields"]).index(given)][order].tolist() for name, given in names.items()}
     assert of["code"] == ["1", "2", "3", "4"]
     assert of["road"] == ["=HYPERLINK(1)", "B 10", "B 10", "Straße =1"]
     assert of["side"][:1] == ["left"]
     assert of["lon_deg"] == pytest.approx([*(m["lon_deg"] for m in markers), -77.15], abs=1e-9)
     assert of["horizontal_rmse_m"][:3] == pytest.approx([0.01] * 3)
-    points = shapely.from_wkb(geometry)
+    points = shapely.from_wkb(geometry)[order]
     assert shapely.get_y(points) == pytest.approx([m["lat_deg"] for m in markers] + [-1e-9], abs=1e-12)
     info = read_info(path)
     assert info["features"] == 4
     # a height that is unknown is none, not zero
-    assert info["geometry_type"] == ("Point" if kind == "shapefile" else "Point Z")
+    assert info["geometry_type"] == ("Point Z" if kind == "gpkg" else "Point")
     assert shapely.has_z(points).tolist() == [kind == "gpkg"] * 3 + [False]
     if kind == "gpkg":
         assert shapely.get_z(points[:3]).tolist() == [160.25, 161.25, 162.25]
+
+
+def test_geoparquet_is_as_its_standard_has_it(
+    server: LiveServer, client: httpx.Client, markers: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GeoParquet 1.1.0: required members, geometry as ISO WKB, and a column of boxes that the metadata name."""
+    monkeypatch.setattr(exports, "_PAGE", 2)
+    monkeypatch.setattr(formats, "_GIS_PAGE", 2)
+    monkeypatch.setattr(server.app.state.use_cases.exports, "_write", formats.write_file)
+    low = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": -1e-9}, "road": "Straße =1"}
+    assert client.post("/v1/markers", json=low).status_code == 201
+    answer = client.get("/v1/exports/geoparquet")
+    assert answer.headers["content-type"] == "application/vnd.apache.parquet"
+    assert "markers.parquet" in answer.headers["content-disposition"]
+    file = parquet.ParquetFile(io.BytesIO(answer.content))
+    assert file.metadata.num_row_groups == 2
+    assert file.metadata.row_group(0).column(0).compression == "ZSTD"
+    table = file.read()
+    assert table.column_names == [*FIELDS, "bbox", "geometry"]
+    assert {table.schema.field(name).type for name in TEXTS} == {pa.string()}
+    assert {table.schema.field(name).type for name in NUMBERS} == {pa.float64()}
+    columns = table.to_pydict()
+    assert columns["code"] == ["1", "2", "3", "4"]
+    assert columns["road"] == ["=HYPERLINK(1)", "B 10", "B 10", "Straße =1"]
+    assert columns["height_m"] == [160.25, 161.25, 162.25, None]
+    assert columns["lon_deg"] == [*(m["lon_deg"] for m in markers), -77.15]
+    assert [row["id"] for row in csv.DictReader(io.StringIO(client.get("/v1/exports/csv").text))] == columns["id"]
+    points = shapely.from_wkb(columns["geometry"])
+    assert [int.from_bytes(wkb[1:5], "little") for wkb in columns["geometry"]] == [1001, 1001, 1001, 1]
+    assert shapely.get_z(points[:3]).tolist() == [160.25, 161.25, 162.25]
+    bounds = shapely.bounds(points).tolist()
+    assert [[box[name] for name in ("xmin", "ymin", "xmax", "ymax")] for box in columns["bbox"]] == bounds
+    geo = json.loads(file.metadata.metadata[b"geo"])
+    assert (geo["version"], geo["primary_column"], list(geo["columns"])) == ("1.1.0", "geometry", ["geometry"])
+    about = geo["columns"]["geometry"]
+    assert (about["encoding"], about["geometry_types"], about["edges"]) == ("WKB", ["Point", "Point Z"], "planar")
+    assert CRS.from_json_dict(about["crs"]) == CRS("EPSG:4326")
+    assert about["covering"] == {"bbox": {name: ["bbox", name] for name in ("xmin", "ymin", "xmax", "ymax")}}
+    assert about["bbox"] == [-77.15, -1e-9, 160.25, markers[2]["lon_deg"], LAT, 162.25]
+    assert "epoch" not in about
+
+
+def test_geoparquet_needs_its_library(
+    client: httpx.Client, markers: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)  # as where the extra is not installed
+    answers = client.get("/v1/exports/geoparquet"), client.post("/v1/exports", json={"format": "geoparquet"})
+    for answer in answers:
+        assert (answer.status_code, answer.json()["field"]) == (422, "format"), answer.text
+        assert "waymark-roads[parquet]" in answer.json()["cure"]
+
+
+@pytest.mark.parametrize("kind", ["shapefile", "flatgeobuf"])
+def test_a_height_that_is_unknown_is_not_zero(client: httpx.Client, tmp_path: Path, kind: str) -> None:
+    """Points of one file all have z or none; with a frame, heights above any datum are z."""
+    for k, height in enumerate(({"height_m": 160.5, "vertical_datum": "EPSG:7837"}, {})):
+        position = {"lon_deg": LON + k * 1e-3, "lat_deg": LAT, **height}
+        assert client.post("/v1/markers", json={"family": "cerpm", "position": position, "road": f"{k}"}).is_success
+    path = tmp_path / f"markers.{'shp.zip' if kind == 'shapefile' else 'fgb'}"
+    for road, asked, z in (
+        (None, {"crs": "EPSG:32632"}, [None, None]),
+        ("0", {"crs": "EPSG:32632"}, [160.5]),
+        ("0", {}, [None]),
+    ):
+        answer = client.get(f"/v1/exports/{kind}", params={**asked, **({"road": road} if road else {})})
+        assert answer.status_code == 200, answer.text
+        path.write_bytes(answer.content)
+        points = shapely.from_wkb(raw.read(f"/vsizip/{path}" if kind == "shapefile" else path)[2])
+        assert [shapely.get_z(point) if point.has_z else None for point in points] == z, (road, asked)
 
 
 def test_only_ellipsoidal_heights_are_in_geometries(client: httpx.Client, tmp_path: Path) -> None:

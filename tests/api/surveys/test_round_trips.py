@@ -15,6 +15,7 @@ import httpx
 import numpy as np
 import pytest
 import shapely
+from pyarrow import parquet
 from pyogrio import raw
 from pyproj import CRS, Transformer
 
@@ -60,7 +61,7 @@ SYSTEMS = (
     Declared("EPSG:31983"),  # Brazil
     Declared("EPSG:32632", "WGS 84 (G2139)", 2026.4),  # UTM of WGS 84
 )
-FORMATS = ("csv", "geojson", "gpkg", "shapefile", "landxml", "dxf")
+FORMATS = ("csv", "geojson", "gpkg", "geoparquet", "flatgeobuf", "shapefile", "landxml", "dxf")
 LIMIT_MM = 1.0
 
 
@@ -102,10 +103,14 @@ def read_back(kind: str, content: bytes, folder: Path, unit_m: float) -> Floats:
     elif kind == "geojson":
         for feature in json.loads(content)["features"]:
             rows.append((int(feature["properties"]["code"]), *feature["geometry"]["coordinates"]))
-    elif kind in ("gpkg", "shapefile"):
-        path = folder / f"a.{'gpkg' if kind == 'gpkg' else 'shp.zip'}"
+    elif kind == "geoparquet":
+        table = parquet.read_table(io.BytesIO(content)).to_pydict()
+        points = shapely.get_coordinates(shapely.from_wkb(table["geometry"]), include_z=True)
+        rows = [(int(code), *point) for code, point in zip(table["code"], points.tolist(), strict=True)]
+    elif kind in ("gpkg", "flatgeobuf", "shapefile"):
+        path = folder / {"gpkg": "a.gpkg", "flatgeobuf": "a.fgb", "shapefile": "a.shp.zip"}[kind]
         path.write_bytes(content)
-        meta, _, geometry, fields = raw.read(path if kind == "gpkg" else f"/vsizip/{path}")
+        meta, _, geometry, fields = raw.read(f"/vsizip/{path}" if kind == "shapefile" else path)
         codes = fields[list(meta["fields"]).index("code")]
         points = shapely.get_coordinates(shapely.from_wkb(geometry), include_z=True)
         rows = [(int(code), *point) for code, point in zip(codes, points.tolist(), strict=True)]
@@ -144,7 +149,44 @@ def test_coordinates_come_out_as_they_went_in(
                      + " | ".join(f"{worst_mm[kind]:.2f}" for kind in FORMATS) + " |")  # fmt: skip
         assert max(worst_mm.values()) < LIMIT_MM, (declared, worst_mm)
     with capsys.disabled():
-        print("\n".join(["", f"| system | realization | {' | '.join(FORMATS)} |", "|---|---|" + "--:|" * 6, *lines]))
+        print(
+            "\n".join(
+                ["", f"| system | realization | {' | '.join(FORMATS)} |", "|---|---|" + "--:|" * len(FORMATS), *lines]
+            )
+        )
+
+
+@pytest.mark.parametrize("declared", [SYSTEMS[0], SYSTEMS[2], SYSTEMS[16], SYSTEMS[20], SYSTEMS[24]])
+def test_geoparquet_and_flatgeobuf_state_their_system(client: httpx.Client, tmp_path: Path, declared: Declared) -> None:
+    table = places(declared.crs)
+    imported(client, declared, table, "a road")
+    asked = {"crs": declared.crs}
+    file = parquet.ParquetFile(io.BytesIO(client.get("/v1/exports/geoparquet", params=asked).content))
+    geometry = json.loads(file.metadata.metadata[b"geo"])["columns"]["geometry"]
+    assert CRS.from_json_dict(geometry["crs"]) == CRS(declared.crs)
+    assert geometry["geometry_types"] == ["Point Z"]
+    assert geometry["bbox"] == pytest.approx([*table.min(0), *table.max(0)], abs=1e-3)
+    rows = file.read().to_pydict()
+    assert set(rows["geometry_crs"]) == {declared.crs}
+    assert set(rows["geometry_epoch"]) == {geometry.get("epoch")}
+    assert declared.epoch in (None, geometry.get("epoch"))
+    boxes = [[box[name] for name in ("xmin", "ymin", "xmax", "ymax")] for box in rows["bbox"]]
+    assert boxes == shapely.bounds(shapely.from_wkb(rows["geometry"])).tolist()
+    path = tmp_path / "a.fgb"
+    path.write_bytes(client.get("/v1/exports/flatgeobuf", params=asked).content)
+    meta, *_ = raw.read(path)
+    assert CRS(meta["crs"]) == CRS(declared.crs)
+    assert meta["geometry_type"] == "Point Z"
+
+
+def test_geoparquet_states_an_epoch_only_if_it_is_that_of_all(client: httpx.Client) -> None:
+    for number, (epoch, expected) in enumerate(((2024.0, 2024.0), (2026.4, None))):
+        declared = Declared("EPSG:25832", "ETRF2000", epoch)
+        imported(client, declared, places(declared.crs) + number * 500, f"road {number}", 3 * number + 1)
+        for asked, stated in (({"crs": "EPSG:25832"}, expected), ({"crs": "EPSG:25832", "epoch": 2020.0}, 2020.0)):
+            content = client.get("/v1/exports/geoparquet", params=asked).content
+            metadata = parquet.read_metadata(io.BytesIO(content)).metadata
+            assert json.loads(metadata[b"geo"])["columns"]["geometry"].get("epoch") == stated
 
 
 @pytest.mark.parametrize(
