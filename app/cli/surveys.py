@@ -113,5 +113,5 @@ def export_markers(
         typer.echo(orjson.dumps({"file": str(out), "left_out": left_out}, option=orjson.OPT_INDENT_2))
         return
     if left_out:
-        typer.echo(f"left out, too far from the file's UTM zone: {' '.join(left_out)}", err=True)
+        typer.echo(f"left out, outside the area of the file's reference system: {' '.join(left_out)}", err=True)
     typer.echo(out)

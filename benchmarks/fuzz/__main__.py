@@ -1,7 +1,8 @@
 """``python -m benchmarks.fuzz [ITEM ...] [--seconds N] [--short]``: print what was tried and what survived.
 
 Items: the names of parsers, `parsers` for all of them, `grammar` for valid files whose content is compared, `frames`
-for damaged pictures in the decoder processes, `registry` for the registry beside a model. The exit status is 1 where something failed; its smallest input is printed.
+for damaged pictures in the decoder processes, `registry` for the registry beside a model. The exit status is 1 where
+something failed; its smallest input is printed.
 """
 
 from __future__ import annotations
