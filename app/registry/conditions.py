@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+import shapely
 import sqlalchemy as sa
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
@@ -21,6 +22,7 @@ from sqlalchemy.sql.functions import FunctionElement
 from app.geodesy import LocalizationGrade, grade_accuracy, total_accuracy_m
 from app.geodesy.place import stored_frame
 from app.registry.column_types import AnyColumn
+from app.registry.spatial import Area, within_area
 from app.values import JsonObject
 
 # === Columns of a marker's grade, also for rows and versions from before there were grades.
@@ -114,21 +116,33 @@ class Joined:
     conditions: tuple[Condition, ...]
 
 
-Condition = Compared | Missing | Constant | Not | Joined
+@dataclass(frozen=True, slots=True)
+class Located:
+    """The feature is in an area or touches it; `strictly`: it is within the area, and not on its edge alone."""
+
+    area: Area
+    strictly: bool = False
 
 
-def condition_sql(condition: Condition, columns: dict[str, AnyColumn]) -> sa.ColumnElement[bool]:
-    """The condition as SQL on columns, by their properties' names."""
+Condition = Compared | Missing | Constant | Not | Joined | Located
+GEOMETRY = "geometry"
+"""The name of a feature's geometry in filters, beside those of its properties."""
+
+
+def condition_sql(condition: Condition, columns: dict[str, AnyColumn], table: sa.Table) -> sa.ColumnElement[bool]:
+    """The condition as SQL on columns, by their properties' names, and on the places of a table's rows."""
     match condition:
+        case Located(area, strictly):
+            return within_area(area, table, strictly=strictly).self_group()
         case Constant(value):
             return sa.literal(1, sa.Integer) == sa.literal(int(value), sa.Integer)
         case Missing(name):
             return columns[name].is_(None)
         case Not(inner):
-            return sa.not_(condition_sql(inner, columns).self_group())
+            return sa.not_(condition_sql(inner, columns, table).self_group())
         case Joined(every, conditions):
             join = sa.and_ if every else sa.or_
-            return join(*(condition_sql(inner, columns).self_group() for inner in conditions)).self_group()
+            return join(*(condition_sql(inner, columns, table).self_group() for inner in conditions)).self_group()
         case Compared(name, "like", value):
             return _Like(columns[name], sa.literal(str(value)), sa.literal(_glob(str(value))))
         case Compared(name, symbol, value):
@@ -142,9 +156,12 @@ def condition_sql(condition: Condition, columns: dict[str, AnyColumn]) -> sa.Col
 
 def holds(condition: Condition, values: Mapping[str, object]) -> bool | None:
     """Whether the condition holds of these values by their properties' names, as `condition_sql` has it; None of what
-    is unknown.
+    is unknown. The value of `GEOMETRY` is a shape.
     """
     match condition:
+        case Located(area, strictly):
+            shape, found = values[GEOMETRY], shapely.from_wkb(area.wkb)
+            return bool(shapely.within(shape, found) if strictly else shapely.intersects(shape, found))
         case Constant(value):
             return value
         case Missing(name):

@@ -264,7 +264,7 @@ def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
         column = table.columns[name]
         conditions.append(column == sa.bindparam(f"v{k}", type_=column.type))
     if shape.where is not None:
-        conditions.append(condition_sql(shape.where, table.columns))
+        conditions.append(condition_sql(shape.where, table.columns, table.table))
     if shape.after:
         conditions.append(c.id > sa.bindparam("after"))
     return conditions

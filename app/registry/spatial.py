@@ -201,7 +201,7 @@ class _PreparedArea:
 
     @cached_property
     def shape(self) -> shapely.Geometry:
-        """The polygons, prepared when the first point is compared."""
+        """The shape, prepared when the first point is compared."""
         shape = shapely.from_wkb(self._wkb)
         shapely.prepare(shape)
         return shape
@@ -213,10 +213,10 @@ _PREPARED: WeakValueDictionary[bytes, _PreparedArea] = WeakValueDictionary()
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """One polygon or several, with straight edges in longitude and latitude; none spans the antimeridian."""
+    """Polygons, lines or points with straight edges in longitude and latitude; none spans the antimeridian."""
 
     wkb: bytes  # Well-known binary, little-endian
-    boxes: tuple[Box, ...]  # one around each polygon
+    boxes: tuple[Box, ...]  # one around each part
     # names the area in statements of SQLite, for which a call of a function with 10,000 vertices takes 0.3 ms
     key: bytes = field(init=False, compare=False, repr=False)
     _prepared: _PreparedArea = field(init=False, compare=False, repr=False)
@@ -306,14 +306,15 @@ def _within_part(box: Box, table: sa.Table) -> sa.ColumnElement[bool]:
     return sa.and_(proposed_by_index(table, west, south, east, north), exact)
 
 
-def within_area(area: Area) -> sa.ColumnElement[bool]:
-    """Markers inside an area or on its edge; both databases use GEOS."""
+def within_area(area: Area, table: sa.Table = markers, *, strictly: bool = False) -> sa.ColumnElement[bool]:
+    """Rows inside an area or, unless `strictly`, on its edge; both databases use GEOS."""
     shape = (sa.literal(area.wkb, sa.LargeBinary), sa.literal(area.key, sa.LargeBinary))
-    return sa.and_(sa.or_(*(within_box(box) for box in area.boxes)), _Covered(*shape))
+    found = (_Contained if strictly else _Covered)(*shape, table.c.row, table.c.lon_deg, table.c.lat_deg)
+    return sa.and_(sa.or_(*(within_box(box, table) for box in area.boxes)), found)
 
 
 class _Covered(FunctionElement[bool]):
-    """Markers that an area covers: its well-known binary, its key."""
+    """Rows that an area covers: its well-known binary, its key, row column, longitude, latitude."""
 
     name = "waymark_covered"
     type = sa.Boolean()
@@ -324,18 +325,27 @@ class _Covered(FunctionElement[bool]):
         return self
 
 
+class _Contained(_Covered):
+    """The same without the area's edge."""
+
+    name = "waymark_contained"
+    inherit_cache = True
+
+
 @compiles(_Covered, "sqlite")
 def _by_function(element: _Covered, compiler: SQLCompiler, **how: object) -> str:
-    _wkb, key = element.clauses
-    return compiler.process(sa.func.waymark_covers(key, markers.c.lon_deg, markers.c.lat_deg), **how)
+    _wkb, key, _row, lon_deg, lat_deg = element.clauses
+    function = sa.func.waymark_contains if isinstance(element, _Contained) else sa.func.waymark_covers
+    return compiler.process(function(key, lon_deg, lat_deg), **how)
 
 
 @compiles(_Covered, "postgresql")
 def _by_postgis(element: _Covered, compiler: SQLCompiler, **how: object) -> str:
-    wkb, _key = element.clauses
+    wkb, _key, row, _lon, _lat = element.clauses
     area = sa.func.ST_GeomFromWKB(wkb, sa.literal_column("4326"))
-    point = sa.table("markers", sa.column("geom")).c.geom
-    return compiler.process(sa.func.ST_Covers(area, point), **how)
+    point = sa.table(row.table.name, sa.column("geom")).c.geom
+    function = sa.func.ST_Contains if isinstance(element, _Contained) else sa.func.ST_Intersects
+    return compiler.process(function(area, point), **how)
 
 
 def covers(area: Area, lon_deg: float, lat_deg: float) -> bool:
@@ -345,6 +355,10 @@ def covers(area: Area, lon_deg: float, lat_deg: float) -> bool:
 
 def _covers(key: bytes, lon_deg: float, lat_deg: float) -> bool:
     return bool(shapely.intersects_xy(_PREPARED[key].shape, lon_deg, lat_deg))
+
+
+def _contains(key: bytes, lon_deg: float, lat_deg: float) -> bool:
+    return bool(shapely.contains_xy(_PREPARED[key].shape, lon_deg, lat_deg))
 
 
 def within_radius(lon_deg: float, lat_deg: float, radius_m: float) -> sa.ColumnElement[bool]:
@@ -371,3 +385,4 @@ def register_functions(connection: sqlite3.Connection) -> None:
     """Give a SQLite connection the functions that the queries use."""
     connection.create_function("waymark_distance_m", 4, distance_m, deterministic=True)
     connection.create_function("waymark_covers", 3, _covers, deterministic=True)
+    connection.create_function("waymark_contains", 3, _contains, deterministic=True)

@@ -31,6 +31,7 @@ from app.formats.surveys.read import read_survey
 from app.formats.traces.read import read_trace
 from app.markers.cerpm import KEY_BYTES, CerpmMessage
 from app.planning.rules import read_rules
+from app.services.markers.searches import area_of_shape
 from benchmarks.fuzz.mutations import damaged
 from benchmarks.fuzz.pictures import list_pictures
 
@@ -188,7 +189,12 @@ _KINDS = {
 
 
 def _filters(language: str) -> Callable[[bytes], object]:
-    reader = Reader(_KINDS, lambda text: datetime.fromisoformat(text).astimezone(UTC), float)
+    reader = Reader(
+        _KINDS,
+        lambda text: datetime.fromisoformat(text).astimezone(UTC),
+        float,
+        lambda shape, within_m: area_of_shape(shape, "filter", within_m),
+    )
 
     def parse(data: bytes) -> object:
         try:

@@ -1,6 +1,8 @@
 """Filter expressions of clients: Common Query Language (OGC 21-065r2), basic-cql2 and LIKE, BETWEEN, IN, text and JSON.
 
-A property stands on one side of a comparison, a value of its kind on the other. Old clients say "cql-text" of the same.
+A property stands on one side of a comparison, a value of its kind on the other. The geometry is compared with another
+one by S_INTERSECTS, S_WITHIN, S_DISJOINT and, as the common extension, S_DWITHIN. Old clients say "cql-text" of the
+same, with INTERSECTS, WITHIN, DISJOINT and DWITHIN.
 """
 
 from __future__ import annotations
@@ -10,9 +12,25 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, NoReturn
 
+import orjson
+import shapely
+from shapely.errors import ShapelyError
+
 from app.errors import MalformedRequest
 from app.formats.json_text import parse_json
-from app.registry.conditions import COMPARISONS, Compared, Condition, Constant, Joined, Missing, Not, Value
+from app.registry.conditions import (
+    COMPARISONS,
+    GEOMETRY,
+    Compared,
+    Condition,
+    Constant,
+    Joined,
+    Located,
+    Missing,
+    Not,
+    Value,
+)
+from app.registry.spatial import Area
 
 LANGUAGES = ("cql2-text", "cql2-json", "cql-text")
 MAX_DEPTH = 20
@@ -31,7 +49,19 @@ _TOKEN = re.compile(
 )
 _WORDS = ("AND", "OR", "NOT", "IS", "NULL", "LIKE", "BETWEEN", "IN", "TRUE", "FALSE", "TIMESTAMP", "DATE")
 _MIRRORED = {"<": ">", ">": "<", "<=": ">=", ">=": "<="}
+SPATIAL = ("S_INTERSECTS", "S_WITHIN", "S_DISJOINT", "S_DWITHIN")
+_OLD_SPATIAL = {name.removeprefix("S_"): name for name in SPATIAL}
+_WKT = ("POINT", "LINESTRING", "POLYGON", "MULTIPOINT", "MULTILINESTRING", "MULTIPOLYGON")
+_M_PER_UNIT = {
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
+    **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1000.0),
+    **dict.fromkeys(("ft", "feet"), 0.3048),
+    **dict.fromkeys(("mi", "mile", "miles", "statute miles"), 1609.344),
+}
+MAX_SPATIAL = 20
+"""Spatial conditions, each of which asks the index and compares what it finds. Bounds the time; chosen by hand."""
 Token = tuple[str, str]
+Place = Callable[[shapely.Geometry, float], Area]
 Moment = Callable[[str], datetime]
 Number = Callable[[str], float]
 
@@ -45,12 +75,15 @@ class Reader:
         string, number, integer or date-time, by the name of each property.
     moment, number : callable
         The moment or the number that a text says.
+    place : callable
+        The area of a geometry in the filter's CRS, with all that is within a distance of it. [m]
     """
 
-    def __init__(self, kinds: Mapping[str, str], moment: Moment, number: Number) -> None:
+    def __init__(self, kinds: Mapping[str, str], moment: Moment, number: Number, place: Place) -> None:
         self._kinds = kinds
         self._moment = moment
         self._number = number
+        self._place = place
 
     def read(self, expression: str, language: str) -> Condition:
         """The condition that an expression says.
@@ -63,6 +96,8 @@ class Reader:
         condition = _Json(self).read(expression) if language == "cql2-json" else _Text(self, expression).read()
         if _size(condition) > MAX_CONDITIONS:
             refuse_filter("the filter has too many conditions", f"{MAX_CONDITIONS} conditions")
+        if (places := _size(condition, Located)) > MAX_SPATIAL:
+            refuse_filter(f"the filter has {places} spatial conditions", f"{MAX_SPATIAL} of them")
         patterns = _size(condition, "like")
         if patterns > MAX_PATTERNS:
             refuse_filter(
@@ -78,6 +113,17 @@ class Reader:
         if symbol == "like" and (kind != "string" or not isinstance(value, str)):
             refuse_filter(f"LIKE compares {name} with a pattern", "a property that is text, a pattern that is text")
         return Compared(name, symbol, self._of_kind(name, kind, value))
+
+    def located(self, name: str, operator: str, shape: shapely.Geometry, within_m: float = 0.0) -> Condition:
+        """A comparison of the geometry with another one."""
+        if name not in (GEOMETRY, "geom"):
+            refuse_filter(f"{name[:80]} is no geometry", f"{operator} compares {GEOMETRY} with a geometry")
+        if not isinstance(shape, shapely.Geometry) or shape.is_empty or not shape.is_valid:
+            refuse_filter("a geometry in the filter is empty or crosses itself", "valid points, lines and polygons")
+        if operator == "S_DWITHIN" and not within_m > 0:
+            refuse_filter("S_DWITHIN has no distance above 0", "S_DWITHIN(geometry, POINT(8.4 49), 500, 'm')")
+        condition = Located(self._place(shape, within_m), operator == "S_WITHIN")
+        return Not(condition) if operator == "S_DISJOINT" else condition
 
     def kind_of(self, name: str) -> str:
         """Kind of a property that there is."""
@@ -104,13 +150,23 @@ def refuse_filter(message: str, limit: str, cure: str = "/ogc/api describes the 
     raise MalformedRequest(message, field="filter", limit=limit, cure=cure)
 
 
-def _size(condition: Condition, symbol: str | None = None) -> int:
-    """How many conditions are joined: all, or the comparisons by one operator."""
+def _size(condition: Condition, symbol: str | type[Located] | None = None) -> int:
+    """How many conditions are joined: all, the spatial ones, or the comparisons by one operator."""
     if isinstance(condition, Joined):
         return sum(_size(inner, symbol) for inner in condition.conditions)
     if isinstance(condition, Not):
         return _size(condition.condition, symbol)
-    return int(symbol is None or (isinstance(condition, Compared) and condition.operator == symbol))
+    if symbol is None or isinstance(symbol, type):
+        return int(symbol is None or isinstance(condition, symbol))
+    return int(isinstance(condition, Compared) and condition.operator == symbol)
+
+
+def distance_m(distance: float, unit: object) -> float:
+    """A distance in one of the usual units. [m]"""
+    factor = _M_PER_UNIT.get(unit.lower()) if isinstance(unit, str) else None
+    if factor is None:
+        refuse_filter(f"{str(unit)[:40]!r} is no unit of distances", ", ".join(_M_PER_UNIT))
+    return distance * factor
 
 
 class _Text:
@@ -153,13 +209,63 @@ class _Text:
         if self._peek() in (("word", "TRUE"), ("word", "FALSE")):
             return Constant(self._next()[1] == "TRUE")
         if self._peek()[0] == "name":
-            return self._about(self._next()[1])
+            name = self._next()[1]
+            operator = _OLD_SPATIAL.get(name.upper(), name.upper())
+            return self._spatial(operator) if operator in SPATIAL and self._takes("(") else self._about(name)
         value = self._value()
         symbol = self._comparison()
         kind, name = self._next()
         if kind != "name":
             self._unexpected()
         return self._reader.compared(name, _MIRRORED.get(symbol, symbol), value)
+
+    def _spatial(self, operator: str) -> Condition:
+        """A spatial condition after its opening parenthesis; the geometry may stand on both sides."""
+        first = self._place()
+        self._expect(",")
+        second = self._place()
+        within_m = 0.0
+        if operator == "S_DWITHIN":
+            self._expect(",")
+            distance = self._value()
+            self._expect(",")
+            kind, unit = self._next()
+            if kind not in ("name", "text") or not isinstance(distance, float):
+                self._at -= 1
+                self._unexpected()
+            within_m = distance_m(distance, unit)
+        self._expect(")")
+        name, shape = (first, second) if isinstance(first, str) else (second, first)
+        if not isinstance(name, str) or isinstance(shape, str) or (operator == "S_WITHIN" and shape is first):
+            refuse_filter(f"{operator} compares {GEOMETRY} with a geometry", f"{operator}({GEOMETRY}, POINT(8.4 49))")
+        return self._reader.located(name, operator, shape, within_m)
+
+    def _place(self) -> str | shapely.Geometry:
+        """The name of a property, or a geometry in well-known text or as BBOX."""
+        kind, name = self._next()
+        if kind != "name":
+            self._at -= 1
+            self._unexpected()
+        if name.upper() not in (*_WKT, "BBOX"):
+            return name
+        words, depth = [name.upper()], 0
+        if self._peek()[1].upper() == "Z":
+            words.append(self._next()[1])
+        while True:
+            kind, text = self._next()
+            if kind != "number" and (kind != "sign" or text not in "(),"):
+                self._at -= 1
+                self._unexpected()
+            depth += (text == "(") - (text == ")")
+            words.append(text)
+            if not depth:
+                break
+        if name.upper() == "BBOX":
+            return _box_of([self._reader.number(word) for word in words if word not in ("BBOX", "(", ")", ",")])
+        try:
+            return shapely.from_wkt(" ".join(words))
+        except ShapelyError:
+            return refuse_filter(f"a {name.upper()} of the filter cannot be read", "well-known text: POINT(8.4 49)")
 
     def _about(self, name: str) -> Condition:
         if self._takes("IS"):
@@ -298,14 +404,49 @@ class _Json:
                 return Joined(False, tuple(self._reader.compared(name, "=", _literal(value)) for value in values))
             case "like", [{"property": str(name)}, str(pattern)]:
                 return self._reader.compared(name, "like", pattern)
+            case str(), [{"property": str(name)}, dict(shape), *more] if symbol.upper() in SPATIAL:
+                return self._located(symbol.upper(), name, shape, more)
+            case str(), [dict(shape), {"property": str(name)}] if symbol.upper() in SPATIAL[::2]:
+                return self._located(symbol.upper(), name, shape, [])
             case str(), [{"property": str(name)}, value] if symbol in COMPARISONS:
                 return self._reader.compared(name, symbol, _literal(value))
             case str(), [value, {"property": str(name)}] if symbol in COMPARISONS:
                 return self._reader.compared(name, _MIRRORED.get(symbol, symbol), _literal(value))
         return refuse_filter(
             f"the filter has an operation that is not offered: {str(symbol)[:40]!r}",
-            f"and, or, not, isNull, between, in, like, {', '.join(COMPARISONS)}; a property and values",
+            f"and, or, not, isNull, between, in, like, {', '.join(COMPARISONS)}; a property and values; "
+            f"{', '.join(name.lower() for name in SPATIAL)}",
         )
+
+    def _located(self, operator: str, name: str, shape: dict[str, Any], more: list[object]) -> Condition:
+        match operator, more:
+            case "S_DWITHIN", [int() | float() as distance, unit]:
+                within_m = distance_m(self._reader.number(repr(distance)), unit)
+            case (("S_INTERSECTS" | "S_WITHIN" | "S_DISJOINT"), []):
+                within_m = 0.0
+            case _:
+                refuse_filter(
+                    f"{operator.lower()} has other arguments", "a property, a geometry, a distance and its unit"
+                )
+        if set(shape) == {"bbox"} and isinstance(shape["bbox"], list):
+            sides = [_literal(side) for side in shape["bbox"]]
+            if not all(isinstance(side, int | float) and not isinstance(side, bool) for side in sides):
+                refuse_filter("a bbox in the filter holds something that is no number", "four numbers")
+            found = _box_of([self._reader.number(repr(side)) for side in sides])
+        else:
+            try:
+                found = shapely.from_geojson(orjson.dumps(shape))
+            except (ShapelyError, TypeError):
+                refuse_filter("a geometry in the filter cannot be read", "a geometry of GeoJSON, or a bbox")
+        return self._reader.located(name, operator, found, within_m)
+
+
+def _box_of(sides: list[float]) -> shapely.Geometry:
+    if len(sides) == 6:
+        sides = [sides[0], sides[1], sides[3], sides[4]]
+    if len(sides) != 4 or not (sides[0] < sides[2] and sides[1] < sides[3]):
+        refuse_filter("a box in the filter is not one", "BBOX(west, south, east, north), west below east")
+    return shapely.box(*sides)
 
 
 def _between(reader: Reader, name: str, low: Any, high: Any) -> Condition:

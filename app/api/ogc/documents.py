@@ -37,6 +37,7 @@ from app.api.ogc.responses import (
     link,
 )
 from app.api.ogc.tiles import TILES_REL
+from app.registry.conditions import GEOMETRY
 from app.registry.features import Extent, Field
 from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection, FeatureCrs
 from app.values import JsonObject
@@ -118,7 +119,14 @@ def queryables(collection: Collection, url: str) -> dict[str, object]:
         "$id": url,
         "title": collection.title,
         "type": "object",
-        "properties": _plain(collection),
+        "properties": {
+            GEOMETRY: {
+                "title": "Position" if collection.geometry == "Point" else "Course",
+                "x-ogc-role": "primary-geometry",
+                "format": f"geometry-{collection.geometry.lower()}",
+            },
+            **_plain(collection),
+        },
         "additionalProperties": False,
     }
 
@@ -238,6 +246,8 @@ CONFORMANCE = (
     f"{_CQL2}/cql2-text",
     f"{_CQL2}/cql2-json",
     f"{_CQL2}/basic-cql2",
+    f"{_CQL2}/basic-spatial-functions",
+    f"{_CQL2}/basic-spatial-functions-plus",
     f"{_CQL2}/advanced-comparison-operators",
     f"{_TILES}/core",
     f"{_TILES}/tileset",

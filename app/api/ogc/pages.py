@@ -220,8 +220,10 @@ def _interval(document: CollectionDocument) -> str:
     return " to ".join("open" if moment is None else f"{moment:%Y-%m-%d %H:%M} UTC" for moment in (first, last))
 
 
-def _place(geometry: Mapping[str, Any], *, whole: bool = False) -> str:
+def _place(geometry: Mapping[str, Any] | None, *, whole: bool = False) -> str:
     """Coordinates; of a line its ends, unless all are wanted."""
+    if geometry is None:
+        return "outside the area of this CRS"
     coordinates = geometry["coordinates"]
     if geometry["type"] == "Point":
         return ", ".join(f"{number:.10g}" for number in coordinates)

@@ -10,16 +10,26 @@ from datetime import UTC, datetime, timedelta, timezone
 from typing import NamedTuple, NoReturn
 from urllib.parse import parse_qsl
 
+import shapely
 from starlette.requests import Request
 
 from app.api.ogc.cql2 import LANGUAGES, Reader
-from app.errors import MalformedRequest, ReferenceSystemError
+from app.errors import InvalidParameter, MalformedRequest, ReferenceSystemError
 from app.geodesy import reference_system
 from app.registry.conditions import Condition
 from app.registry.features import FeatureFilter
-from app.registry.spatial import Box
-from app.services.markers.features import COLLECTIONS, EPSG_URI, STORAGE_CRS, AnyCrs, Collection, FeatureCrs, OtherCrs
-from app.services.markers.searches import MAX_OVER_ANTIMERIDIAN_DEG
+from app.registry.spatial import Area, Box
+from app.services.markers.features import (
+    COLLECTIONS,
+    EPSG_URI,
+    STORAGE_CRS,
+    AnyCrs,
+    Collection,
+    FeatureCrs,
+    OtherCrs,
+    in_lon_lat,
+)
+from app.services.markers.searches import MAX_OVER_ANTIMERIDIAN_DEG, area_of_shape
 
 # === The parameters of requests under /ogc in one list: /ogc/api, /openapi.json and the query's reader use it.
 
@@ -60,9 +70,9 @@ _COMMON = {
         {"type": "string", "enum": ["results", "hits"], "default": "results"}, "hits: only numberMatched"
     ),
     "count": Parameter({"type": "boolean", "default": False}, "numberMatched with every page"),
-    "filter": Parameter({"type": "string"}, "An expression on the properties, in the language filter-lang"),
+    "filter": Parameter({"type": "string"}, "An expression on properties and geometry, in the language filter-lang"),
     "filter-lang": Parameter({"type": "string", "enum": LANGUAGES, "default": LANGUAGES[0]}, "Language of filter"),
-    "filter-crs": Parameter(_CRS, "CRS of positions in filter; expressions have none"),
+    "filter-crs": Parameter(_CRS, "CRS of geometries in filter"),
 }
 _OF_TILES = {
     "groups": Parameter(
@@ -309,10 +319,19 @@ def _where(found: dict[str, str], kinds: dict[str, str]) -> Condition | None:
     language = found.get("filter-lang", LANGUAGES[0])
     if language not in LANGUAGES:
         refuse("filter-lang", "filters are not read in this language", ", ".join(LANGUAGES))
-    crs_parameter(found, "filter-crs")  # there are no places in filters: none makes a difference
+    crs = crs_parameter(found, "filter-crs")
     if "filter" not in found:
         return None
-    reader = Reader(kinds, lambda text: _moment(text, last=False, name="filter"), lambda text: number("filter", text))
+
+    def place(shape: shapely.Geometry, within_m: float) -> Area:
+        try:
+            return area_of_shape(in_lon_lat(shape, crs), "filter", within_m)
+        except InvalidParameter as error:
+            refuse("filter", error.message, error.limit or "points, lines and polygons")
+
+    reader = Reader(
+        kinds, lambda text: _moment(text, last=False, name="filter"), lambda text: number("filter", text), place
+    )
     return reader.read(found["filter"], language)
 
 

@@ -29,7 +29,7 @@ from app.geodesy.place import PLATE_FIXED_EPOCH
 from app.geodesy.systems import ELLIPSOID, best_effort, covers
 from app.registry import features as store
 from app.registry.audit import find_head
-from app.registry.conditions import holds, pinned_values
+from app.registry.conditions import GEOMETRY, holds, pinned_values
 from app.registry.database import Database
 from app.registry.features import FIELDS, ON_ROAD, RETIRED, Extent, FeatureFilter, FeatureTable, Field
 from app.registry.health import ITEM_FIELDS, MAINTENANCE
@@ -40,7 +40,7 @@ from app.registry.spatial import Box
 from app.registry.tiles import COARSE_ZOOM, GROUPED_ZOOM, MAX_SINGLE, FeatureGrid, Tile, feature_tile, read_grid
 from app.services.access.access import Caller
 from app.services.ports import Clock
-from app.values import JsonObject
+from app.values import Floats, JsonObject
 
 # === The coordinate reference systems that features can be asked for in, with the axes in the authority's order.
 
@@ -116,6 +116,19 @@ class OtherCrs:
 
 
 AnyCrs = FeatureCrs | OtherCrs
+
+
+def in_lon_lat(shape: shapely.Geometry, crs: AnyCrs) -> shapely.Geometry:
+    """A geometry of a CRS in longitude and latitude; of other systems than WGS 84 to a metre."""
+
+    def turned(places: Floats) -> Floats:
+        first, second = places.T
+        if isinstance(crs, OtherCrs):
+            x, y = (second, first) if crs.is_north_first else (first, second)
+            return np.column_stack(best_effort(crs.name).transform(x, y))
+        return np.array([crs.to_lon_lat(*place) for place in places.tolist()], np.float64).reshape(-1, 2)
+
+    return shapely.transform(shapely.force_2d(shape), turned)
 
 
 # === Collections: what clients list as layers.
@@ -490,10 +503,14 @@ def _matching(
         for line in found:
             if (
                 all(line.properties[name] == value for name, value in wanted.items())
-                and (filtered.where is None or holds(filtered.where, line.properties))
+                and (filtered.where is None or holds(filtered.where, _values_of(line)))
                 and (box is None or _crosses(line, box))
             ):
                 yield line
+
+
+def _values_of(line: Line) -> Mapping[str, object]:
+    return {**line.properties, GEOMETRY: shapely.LineString(line.points)}
 
 
 def _count_lines(connection: sa.Connection, agency_id: str, lines: LineReader, filtered: FeatureFilter) -> int:

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import httpx
 import pytest
+import shapely.geometry
 
 from app.api.ogc.cql2 import Reader
-from app.registry.conditions import Compared, Joined, Not, holds
+from app.registry.conditions import GEOMETRY, Compared, Joined, Not, holds
 from app.registry.features import FIELDS
 from app.services.access.access import Scope
+from app.services.markers.searches import area_of_shape
 from tests.api.ogc.test_features import ITEMS, add, get
 from tests.conftest import LiveServer
 
 pytestmark = pytest.mark.both_databases
 
+SQUARE = "POLYGON((5.1 44.9, 5.3 44.9, 5.3 45.1, 5.1 45.1, 5.1 44.9))"
 # road, measure_m, status
 ROWS = [
     ("A1", 0.0, "planned"),
@@ -84,6 +88,18 @@ TEXTS = {
     "updated_at < DATE('2020-01-01')": [],
     "updated_at >= '0000-01-01T00:00:00Z' AND updated_at < '9999-12-31T23:59:59Z'": [0, 1, 2, 3, 4, 5],
     "road = 'Å' OR road = ''' OR 1=1 --'": [],
+    f"S_INTERSECTS(geometry, {SQUARE})": [1, 2, 3],
+    f"S_WITHIN(geometry, {SQUARE})": [2],
+    f"within(geom, {SQUARE})": [2],
+    f"S_DISJOINT(geometry, {SQUARE})": [0, 4, 5],
+    f"NOT S_INTERSECTS({SQUARE}, geometry) AND status = 'active'": [5],
+    "S_INTERSECTS(geometry, BBOX(5.05, 44, 5.35, 46))": [1, 2, 3],
+    "INTERSECTS(geom, POINT Z (5.2 45 7))": [2],
+    "S_INTERSECTS(geometry, MULTIPOINT((5.2 45), (5.4 45), (0 0)))": [2, 4],
+    "S_INTERSECTS(geometry, LINESTRING(4.95 45, 5.15 45))": [0, 1],
+    "S_DWITHIN(geometry, POINT(5.2 45), 7.9, 'km')": [1, 2, 3],
+    "DWITHIN(geometry, POINT(5.2 45), 7870, meters)": [2],
+    "S_DWITHIN(geometry, LINESTRING(5.0 45.05, 5.1 45.05), 6000, 'm') OR road = 'a1'": [0, 1, 2],
 }
 
 
@@ -97,6 +113,7 @@ def _road(symbol: str, value: Any) -> dict[str, Any]:
     return {"op": symbol, "args": [{"property": "road"}, value]}
 
 
+RING = [[5.1, 44.9], [5.3, 44.9], [5.3, 45.1], [5.1, 45.1], [5.1, 44.9]]
 JSONS: list[tuple[Any, list[int]]] = [
     (_road("=", "A1"), [0]),
     ({"op": "<", "args": [500, {"property": "measure_m"}]}, [3, 5]),
@@ -107,6 +124,13 @@ JSONS: list[tuple[Any, list[int]]] = [
     ({"op": "and", "args": [_road("<>", "x"), {"op": "or", "args": [_road("=", "A1"), _road("=", "a1")]}]}, [0, 2]),
     ({"op": ">", "args": [{"property": "updated_at"}, {"timestamp": "2020-01-01T00:00:00Z"}]}, [0, 1, 2, 3, 4, 5]),
     (True, [0, 1, 2, 3, 4, 5]),
+    ({"op": "s_intersects", "args": [{"property": "geometry"}, {"bbox": [5.05, 44, 5.35, 46]}]}, [1, 2, 3]),
+    ({"op": "s_within", "args": [{"property": "geometry"}, {"type": "Polygon", "coordinates": [RING]}]}, [2]),
+    ({"op": "s_disjoint", "args": [{"type": "Polygon", "coordinates": [RING]}, {"property": "geometry"}]}, [0, 4, 5]),
+    (
+        {"op": "s_dwithin", "args": [{"property": "geometry"}, {"type": "Point", "coordinates": [5.2, 45]}, 7.9, "km"]},
+        [1, 2, 3],
+    ),
 ]
 
 
@@ -133,7 +157,26 @@ BAD_TEXTS = (
     *("id = 'x'", "markers.road = 'x'", "road = 5", "measure_m = 'x'", "measure_m = 1e999", "measure_m = NaN"),
     *("measure_m LIKE 'x'", "road IN ()", "road IS 'x'", "updated_at > 'yesterday'", "updated_at = TIMESTAMP(5)"),
     *("updated_at > TIMESTAMP('2020-13-01T00:00:00Z')", "lower(road) = 'a1'", "road = road", "1 = 1"),
-    *("road = 'A1' OR OR road = 'x'", "S_INTERSECTS(geometry, POINT(0 0))", "NOT " * 10 + "x", "\"\" = 'x'"),
+    *("road = 'A1' OR OR road = 'x'", "NOT " * 10 + "x", "\"\" = 'x'"),
+    *("S_INTERSECTS(road, POINT(0 0))", "S_INTERSECTS(geometry, geometry)", "S_INTERSECTS(geometry, POINT(0))"),
+    *("S_INTERSECTS(geometry, POINT(200 0))", "S_INTERSECTS(geometry, POLYGON((0 0, 1 1, 0 1, 1 0, 0 0)))"),
+    *(
+        "S_WITHIN(POINT(0 0), geometry)",
+        "S_DWITHIN(geometry, POINT(0 0))",
+        "S_DWITHIN(geometry, POINT(0 0), 5, 'parsecs')",
+    ),
+    *(
+        "S_DWITHIN(geometry, POINT(0 0), -5, 'm')",
+        "S_DWITHIN(geometry, POINT(0 0), 1e7, 'm')",
+        "S_INTERSECTS(geometry, POINT",
+    ),
+    *(
+        "S_TOUCHES(geometry, POINT(0 0))",
+        "S_INTERSECTS(geometry, BBOX(5, 44, 4, 46))",
+        "S_INTERSECTS(geometry, POINT EMPTY)",
+    ),
+    *("S_INTERSECTS(geometry, GEOMETRYCOLLECTION(POINT(0 0)))", "S_DWITHIN(geometry, POINT(179.99 0), 9000, 'm')"),
+    " OR ".join([f"S_INTERSECTS(geometry, {SQUARE})"] * 21),
     *(f"{'(' * 30}TRUE{')' * 30}", " OR ".join(["version = 1"] * 201), f"version = {'9' * 400}"),
 )
 BAD_JSONS = (
@@ -152,6 +195,11 @@ BAD_JSONS = (
     '{"op": "like", "args": [{"property": "road"}, 5]}',
     '{"op": "cql2-json", "args": [{"property": "road"}, "x"]}',
     json.dumps(_deep(25)),
+    '{"op": "s_intersects", "args": [{"property": "geometry"}, {"type": "Point", "coordinates": ["a", 1]}]}',
+    '{"op": "s_intersects", "args": [{"property": "geometry"}, {"type": "Circle"}]}',
+    '{"op": "s_intersects", "args": [{"property": "geometry"}, {"bbox": [1, 2, true, 4]}]}',
+    '{"op": "s_intersects", "args": [{"property": "geometry"}, {"bbox": [1, 2]}, 5]}',
+    '{"op": "s_dwithin", "args": [{"property": "geometry"}, {"bbox": [1, 2, 3, 4]}, "5", "m"]}',
 )
 BAD = [
     *((text, None) for text in BAD_TEXTS),
@@ -184,12 +232,32 @@ def test_patterns_are_limited_and_the_refusal_has_the_limit_and_the_cure(roads: 
 def test_values_in_hand_are_filtered_as_both_databases_do(roads: httpx.Client, expression: str) -> None:
     """Lines are put together before they are filtered, so no database does it."""
     kinds = {field.name: field.kind for field in FIELDS}
-    condition = Reader(kinds, _no_time, float).read(expression, "cql2-text")
+    place = partial(area_of_shape, field="filter")
+    reader = Reader(kinds, _no_time, float, lambda shape, within_m: place(shape, within_m=within_m))
+    condition = reader.read(expression, "cql2-text")
     rows = get(roads, ITEMS, limit=100)["features"]
     found = [
-        round((row["geometry"]["coordinates"][0] - 5.0) * 10) for row in rows if holds(condition, row["properties"])
+        round((row["geometry"]["coordinates"][0] - 5.0) * 10)
+        for row in rows
+        if holds(condition, {**row["properties"], GEOMETRY: shapely.geometry.shape(row["geometry"])})
     ]
     assert found == TEXTS[expression]
+
+
+@pytest.mark.parametrize(
+    ("crs", "place"),
+    [("EPSG/0/3857", "578861.35 5621521.49"), ("EPSG/0/4326", "45 5.2"), ("EPSG/0/25831", "673393.7 4985304.9")],
+)
+def test_geometries_may_be_in_another_system(roads: httpx.Client, crs: str, place: str) -> None:
+    uri = f"http://www.opengis.net/def/crs/{crs}"
+    named = {"filter": f"S_DWITHIN(geometry, POINT({place}), 30, 'm')", "filter-crs": uri}
+    page = get(roads, ITEMS, **named)
+    assert [round((one["geometry"]["coordinates"][0] - 5.0) * 10) for one in page["features"]] == [2]
+
+
+def test_lines_are_filtered_by_their_course(roads: httpx.Client) -> None:
+    answer = roads.get("/ogc/collections/marker_lines/items", params={"filter": f"S_INTERSECTS(geometry, {SQUARE})"})
+    assert answer.status_code == 200, answer.text
 
 
 def _no_time(text: str) -> Any:
@@ -221,6 +289,7 @@ def test_what_is_unknown_stays_unknown() -> None:
 
 def test_queryables_and_conformance_say_so(roads: httpx.Client) -> None:
     document = get(roads, "/ogc/collections/markers/queryables")
+    assert document["properties"]["geometry"]["format"] == "geometry-point"
     assert document["properties"]["measure_m"]["type"] == "number"
     assert document["properties"]["updated_at"]["format"] == "date-time"
     asked = get(roads, "/ogc/collections/marker_lines/queryables")["properties"]
