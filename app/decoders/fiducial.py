@@ -57,9 +57,9 @@ class FiducialReading:
     # of a sign whose dimensions are known, in a frame whose camera is known. Its axes are x right, y travel, z up, as a
     # plate's, whatever the sign's mounting.
     pose: PlatePose | None = None
-    reason: str = ""  # why the code was refused
-    # [deg] clockwise by which OpenCV's image stands turned on the sign: 0, 90, 180 or 270; of an upright sign as it was
-    # seen, of a lying one as it is registered. None where it is not known, as without a camera.
+    reason: str = ""  # why the code was refused, or why there is no pose
+    # [deg] clockwise rotation of OpenCV's image on the sign: 0, 90, 180 or 270; of an upright sign as it was seen, of a
+    # lying one as it is registered. None where it is not known, as without a camera.
     turned_deg: int | None = None
 
 
@@ -201,8 +201,8 @@ def _module_px(corners_px: Floats, n: int) -> float:
 
 # === Corners of a sign and the camera -> pose of the sign.
 #
-# Which edge of an upright sign is up is seen: its sides are vertical in the vehicle's frame. So it does not matter
-# whose image the sign shows, or whether it was hung on its side. A lying sign shows nothing of the kind.
+# The camera sees which edge of an upright sign is the upper one, because its sides are vertical in the vehicle's frame.
+# So neither the image that it shows matters, nor whether it was hung on its side. A lying sign has no upper edge.
 #
 # IPPE gives the two poses of a square in closed form (Collins and Bartoli, IJCV 109, 2014). Signs are mounted plumb or
 # flat, and the mount gives the camera's attitude: the pose that fits both is taken, and a few Gauss-Newton steps
@@ -225,7 +225,7 @@ _SIGN_FROM_PLATE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
 
 
 def stand_upright(corners_px: Floats, camera: Camera) -> tuple[Floats, int]:
-    """Corners of an upright sign clockwise from its upper left, and the quarter turns clockwise from those that came.
+    """Corners of an upright sign, clockwise from its upper left, and by how many quarter turns they were renumbered.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def stand_upright(corners_px: Floats, camera: Camera) -> tuple[Floats, int]:
 
 
 def lean_rad(pose: PlatePose, camera: Camera) -> float:
-    """Of the axis of a sign, with the axes of a plate, that should be vertical. [rad]"""
+    """Angle between the vertical and the upward axis of an upright sign. [rad]"""
     up = camera.camera_from_vehicle.T @ pose.rotation[:, 2]
     return math.acos(min(max(float(up[2]), -1.0), 1.0))
 
@@ -480,16 +480,14 @@ def _place(corners_px: Floats, sign: KnownFiducial, camera: Camera) -> tuple[Flo
     corners_px : ndarray, shape (4, 2)
         Clockwise from the upper left of OpenCV's image. [px]
     """
-    geometry = sign.geometry
-    turns: int | None
+    geometry, is_known = sign.geometry, True
     if geometry.mounting is Mounting.UPRIGHT:
         corners_px, turns = stand_upright(corners_px, camera)
     else:
         turns = 2 if geometry.image is SignImage.APRILTAG else 0
         corners_px = np.roll(corners_px, turns, axis=0)
-        if geometry.image is None and sign.code.has_two_images:
-            turns = None
-    turned_deg = None if turns is None else 90 * turns
+        is_known = geometry.image is not None or not sign.code.has_two_images
+    turned_deg = 90 * turns if is_known else None
     pose = locate_fiducial(corners_px, geometry, camera)
     if pose is not None and (lean := lean_rad(pose, camera)) > MAX_LEAN_RAD:
         why = f"the sign would lean by {math.degrees(lean):.0f} degrees, so that its position is not used"

@@ -186,7 +186,7 @@ class Fix:
 
 def fix_from_match(
     pose: PlatePose, camera: Camera, match: Match, label: str, vehicle_heading_deg: float | None, *, epoch: float,
-    doubt: str = "",
+    pose_warning: str = "",
 ) -> Fix | None:  # fmt: skip
     """Vehicle's position in the ITRF at an epoch from one matched plate.
 
@@ -194,8 +194,8 @@ def fix_from_match(
     ----------
     label : str
         What a marker of its family is called.
-    doubt : str
-        Why the pose may be wrong, if it may.
+    pose_warning : str
+        Why the pose may be wrong; empty if nothing shows that.
 
     Returns
     -------
@@ -205,7 +205,7 @@ def fix_from_match(
     if match.row is None or not match.plausible:
         return None
     row = marker_at(match.row, epoch)
-    notes = [*([doubt] if doubt else []), *row_warnings(row, label)]
+    notes = [*([pose_warning] if pose_warning else []), *row_warnings(row, label)]
     if match.ambiguous:
         notes.append(f"several {label}s within reach carry these digits")
     heading_deg, heading_rmse_deg = row.heading_deg, row.heading_rmse_deg

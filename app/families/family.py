@@ -94,7 +94,7 @@ class FrameReader(ABC, Generic[ReadingT, SearchT]):
     def orient(
         self, reading: ReadingT, match: Match, camera: Camera, heading_deg: float | None
     ) -> tuple[ReadingT, str]:
-        """A reading with its pose as the matched marker and the vehicle's heading decide; why the pose is doubtful."""
+        """A reading with its pose as the matched marker and the vehicle's heading decide, and why it may be wrong."""
         return reading, ""
 
     @abstractmethod

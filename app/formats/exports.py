@@ -117,7 +117,7 @@ def _place_in(records: Sequence[Record], frame: ExportFrame, origin: Origin, dat
     place = np.full((3, len(records)), np.nan)
     inside = covers(reference_system(frame.crs).area_of_use, lon, lat)
     if not inside.any():
-        inside[:] = True  # the error says where the system is used
+        inside[:] = True  # all are refused below, with the area that the system is made for
     at = (lon[inside], lat[inside])
     found = positions_in_system(
         *at, height[inside], frame.crs, origin=origin, realization=frame.realization, epoch=frame.epoch

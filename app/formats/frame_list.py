@@ -103,8 +103,7 @@ def read_frame_list(name: str, data: bytes, declaration: PoseDeclaration | None 
             report.leave_out(entry, "malformed", "the row cannot be read")
             continue
         frame = _frame_of(values, declaration, clock)
-        if math.isnan(frame.time_s) and values.get("time") not in (None, "") and report.unread_time is None:
-            report.unread_time = clean_text(str(values["time"]), 40)
+        if report.note_unread_time(values.get("time"), frame.time_s):
             report.warn(f"{report.unread_time!r} is no time between 2000 and 2100; times are {ACCEPTED_TIMES}")
         problem = _problem(frame)
         if problem is not None:

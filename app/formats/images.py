@@ -86,7 +86,7 @@ def _position(tiff: bytes, order: str, directory: int) -> PicturePosition | None
             texts[tag] = _text(tiff, order, count, at)
         elif kind == _RATIONAL and 0 < count <= 3:
             numbers[tag] = _sexagesimal(tiff, _long(tiff, order, at), order, count)
-    if _plain_datum(texts.get(_DATUM, "")) not in ("", "WGS84"):
+    if re.sub(r"[\s_-]", "", texts.get(_DATUM, "")).upper() not in ("", "WGS84"):
         return None
     lat_deg = {"N": 1, "S": -1}.get(texts.get(_NORTH_SOUTH, "")[:1], math.nan) * numbers.get(_LATITUDE, math.nan)
     lon_deg = {"E": 1, "W": -1}.get(texts.get(_EAST_WEST, "")[:1], math.nan) * numbers.get(_LONGITUDE, math.nan)
@@ -103,10 +103,6 @@ def _sexagesimal(tiff: bytes, at: int, order: str, count: int) -> float:
     pairs = struct.unpack_from(f"{order}{2 * count}I", tiff, at)
     parts = [over / under if under else math.nan for over, under in zip(pairs[::2], pairs[1::2], strict=True)]
     return float(sum(part / 60**k for k, part in enumerate(parts)))
-
-
-def _plain_datum(text: str) -> str:
-    return re.sub(r"[\s_-]", "", text).upper()
 
 
 def _focal_35mm(tiff: bytes, order: str, directory: int) -> float | None:
@@ -167,38 +163,35 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
 _KINDS = "JPEG (8-bit) or PNG (8-bit, or 16-bit greyscale from a thermal camera)"
 SEND_AS_IT_IS = "send a JPEG or PNG as the camera wrote it"
-_OTHER_SIGNATURES = (
-    (b"\x00\x00\x00\x01", "a raw H.264 or H.265 stream"),
-    (b"\x00\x00\x01", "an MPEG program stream or a raw stream"),
-    (b"FLV", "a Flash video"),
-    (b"\x28\xb5\x2f\xfd", "compressed by zstd"),
-    (b"\x1f\x8b", "compressed by gzip"),
-    (b"7z\xbc\xaf", "a 7z archive"),
-    (b"Rar!", "a RAR archive"),
-    (b"#ROSBAG V", "a ROS bag of an old version"),
-    (b"GIF8", "a GIF"),
-    (b"BM", "a BMP"),
-    (b"II*\x00", "a TIFF"),
-    (b"MM\x00*", "a TIFF"),
-    (b"RIFF", "a WebP or another RIFF file"),
-    (b"%PDF", "a PDF"),
-    (b"PK\x03\x04", "a ZIP archive"),
-    (b"ffconcat", "a playlist"),
-    (b"#EXTM3U", "a playlist"),
-    (b"v=0", "a session description (SDP)"),
-    (b"<svg", "an SVG"),
-    (b"<?xml", "an XML document"),
-)
-_CURES = {
-    **dict.fromkeys(
-        ("a raw H.264 or H.265 stream", "an MPEG program stream or a raw stream", "a Flash video"),
-        "convert it without loss, e.g. ffmpeg -i FILE -c copy drive.mp4",
+_CONVERT = "convert it without loss, e.g. ffmpeg -i FILE -c copy drive.mp4"
+_UNPACK = "send the file itself, or a ZIP of frames"
+_OTHER_SIGNATURES: tuple[tuple[tuple[bytes, ...], str, str | None], ...] = (
+    ((b"\x00\x00\x00\x01", b"\x00\x00\x01\x67", b"\x00\x00\x01\x40"), "a raw H.264 or H.265 stream", _CONVERT),
+    ((b"\x00\x00\x01\xba", b"\x00\x00\x01\xb3"), "an MPEG program stream or a raw stream", _CONVERT),
+    ((b"FLV",), "a Flash video", _CONVERT),
+    (
+        (b"\x28\xb5\x2f\xfd",), "compressed by zstd",
+        "expand it, e.g. zstd -d FILE; bags with compressed messages or chunks are read as they are",
     ),
-    "compressed by zstd": "expand it, e.g. zstd -d FILE; bags with compressed messages or chunks are read as they are",
-    "compressed by gzip": "expand it, e.g. gunzip FILE",
-    **dict.fromkeys(("a 7z archive", "a RAR archive"), "send the file itself, or a ZIP of frames"),
-    "a ROS bag of an old version": "convert it to version 2.0, e.g. rosbag fix or rosbag reindex",
-}
+    ((b"\x1f\x8b",), "compressed by gzip", "expand it, e.g. gunzip FILE"),
+    ((b"7z\xbc\xaf",), "a 7z archive", _UNPACK),
+    ((b"Rar!",), "a RAR archive", _UNPACK),
+    (
+        (b"#ROSBAG V",), "a ROS bag of an old version",
+        "convert it to version 2.0, e.g. rosbag fix or rosbag reindex",
+    ),
+    ((b"GIF8",), "a GIF", None),
+    ((b"BM",), "a BMP", None),
+    ((b"II*\x00", b"MM\x00*"), "a TIFF", None),
+    ((b"RIFF",), "a WebP or another RIFF file", None),
+    ((b"%PDF",), "a PDF", None),
+    ((b"PK\x03\x04",), "a ZIP archive", None),
+    ((b"ffconcat", b"#EXTM3U"), "a playlist", None),
+    ((b"v=0",), "a session description (SDP)", None),
+    ((b"<svg",), "an SVG", None),
+    ((b"<?xml",), "an XML document", None),
+)  # fmt: skip
+"""First bytes of other files, their kind, and how a drive in one is made one that is read."""
 _MAX_SCANS = 64  # of a progressive JPEG; libjpeg writes about 10
 _MIRRORED = (2, 4, 5, 7)
 _MARKER = re.compile(rb"\xff+[^\xff]", re.DOTALL)
@@ -279,14 +272,18 @@ def is_picture(head: bytes) -> bool:
     return head.startswith((_PNG_SIGNATURE, _JPEG_SIGNATURE))
 
 
-def unknown_picture(head: bytes, accepted: str = _KINDS, cure: str = SEND_AS_IT_IS) -> UnsupportedUpload:
-    """The refusal of a file that is no picture; with the detected kind of the file and the accepted kinds."""
-    kind = next((name for signature, name in _OTHER_SIGNATURES if head.startswith(signature)), None)
+def unknown_picture(
+    head: bytes, accepted: str = _KINDS, cure: str = SEND_AS_IT_IS, *, of_drive: bool = False
+) -> UnsupportedUpload:
+    """The refusal of a file that is no picture, with its kind and the accepted kinds.
+
+    `of_drive` is true where drives are accepted: then the cure is that of the kind, where it has one.
+    """
+    kind, drive_cure = next((found[1:] for found in _OTHER_SIGNATURES if head.startswith(found[0])), (None, None))
     if head[4:8] == b"ftyp":
-        kind = "a video, HEIC or AVIF"
-    cure = _CURES.get(kind or "", cure)
+        kind, drive_cure = "a video, HEIC or AVIF", None
     what = f"the file is {kind}, not a JPEG or PNG picture" if kind else "the file is not a JPEG or PNG picture"
-    return UnsupportedUpload(what, field=FIELD, limit=accepted, cure=cure)
+    return UnsupportedUpload(what, field=FIELD, limit=accepted, cure=(of_drive and drive_cure) or cure)
 
 
 def _check_size(width_px: int, height_px: int, limits: ImageLimits) -> None:

@@ -8,10 +8,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from itertools import chain, islice
 
 from pydantic import Field
 
 from app.errors import InvalidParameter, ReferenceSystemError
+from app.formats.text import clean_text
 from app.geodesy import place_position, reference_system
 from app.geodesy.systems import is_global
 from app.inputs import Declaration, Flag, Number
@@ -54,6 +56,14 @@ class LogReport:
         """Add a warning for the uploader, once."""
         if text not in self.warnings and len(self.warnings) < MAX_LISTED:
             self.warnings.append(text)
+
+    def note_unread_time(self, value: object, time_s: float) -> bool:
+        """Keep the first value that should be a time and cannot be read, `time_s` being NaN; True if it is this one."""
+        text = "" if value is None else clean_text(str(value), 40)
+        if not text or self.unread_time is not None or not math.isnan(time_s):
+            return False
+        self.unread_time = text
+        return True
 
 
 # === Times of logs, converted to seconds since 1970-01-01 UTC.
@@ -136,13 +146,13 @@ class LogClock(Declaration):
         """
         if self.day_first is not None:
             return self
-        written = iter(texts)
-        head = [text for _row, text in zip(range(_COLUMN_HEAD), written, strict=False)]
-        if not any(_is_in_doubt(text) for text in head):
+        written = (text for text in texts if text.strip())
+        head = list(islice(written, _COLUMN_HEAD))
+        if not any(_is_local_date(text) for text in head):
             return self
         unclear: str | None = None
         orders: dict[bool, str] = {}
-        for text in (*head, *written):
+        for text in chain(head, written):
             found = _LOCAL_DATE.match(text.strip())
             if found is None or found["year"] or found["sign"] == ".":
                 continue
@@ -231,8 +241,8 @@ class LogClock(Declaration):
         return at.timestamp() - zone_s
 
 
-def _is_in_doubt(text: str) -> bool:
-    """Whether a text is a date whose day and month could be exchanged."""
+def _is_local_date(text: str) -> bool:
+    """Whether a text is a date in digits in which either the day or the month may come first."""
     found = _LOCAL_DATE.match(text.strip()) if "/" in text or "-" in text else None
     return found is not None and not found["year"] and found["sign"] != "."
 

@@ -26,21 +26,27 @@ MAX_NAME = 120
 _SAMPLE_BYTES = 4096  # [byte] by which text is recognized
 _DECODED_BYTES = 1 << 20  # [byte] checked at a time, to bound memory
 _MAX_CONTROL_SHARE = 0.02  # [1] of the sample: a damaged line or two, far below random bytes (0.11)
-_BOMS = (
+BOMS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+"""Byte order marks, and the encodings that they show."""
 _C1_CONTROL = re.compile(rb"[\x80-\x9f]")  # printable in Windows-1252, never in ISO 8859-1
 _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f]")
 _BLANK = "\r \t\ufeff"
 
 
+def count_of(number: int, what: str) -> str:
+    """A number with its noun, in the plural where it has to be."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def is_text(data: bytes) -> bool:
     """Whether bytes look like text: a byte order mark, or hardly any control characters at the beginning."""
-    if data.startswith(tuple(bom for bom, _name in _BOMS)):
+    if data.startswith(tuple(bom for bom, _name in BOMS)):
         return True
     sample = data[:_SAMPLE_BYTES]
     return len(_CONTROL.findall(sample)) <= len(sample) * _MAX_CONTROL_SHARE
@@ -60,7 +66,7 @@ def decode_text(name: str, data: bytes) -> tuple[str, str | None]:
     UnreadableUpload
         The file begins with a byte order mark and continues in another encoding.
     """
-    for bom, encoding in _BOMS:
+    for bom, encoding in BOMS:
         if data.startswith(bom):
             try:
                 return data.decode(encoding), None
@@ -94,7 +100,7 @@ def as_utf8(data: bytes, encoding: str | None = None) -> tuple[bytes, str]:
     UnreadableUpload
         The file is not text in this encoding, or holds NUL.
     """
-    mark, of_mark = next(((bom, name) for bom, name in _BOMS if data.startswith(bom)), (b"", None))
+    mark, of_mark = next(((bom, name) for bom, name in BOMS if data.startswith(bom)), (b"", None))
     name = of_mark or encoding or guess_encoding(data)
     name = "utf-8" if name == "utf-8-sig" else name
     try:
@@ -117,7 +123,7 @@ def as_utf8(data: bytes, encoding: str | None = None) -> tuple[bytes, str]:
 
 def guess_encoding(data: bytes) -> str:
     """Encoding of text by its byte order mark, or by which bytes occur."""
-    for bom, name in _BOMS:
+    for bom, name in BOMS:
         if data.startswith(bom):
             return name
     sample = data[:_SAMPLE_BYTES]

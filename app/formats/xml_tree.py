@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from xml.parsers import expat
 
 from app.errors import UnreadableUpload, UploadTooLarge
+from app.formats.text import BOMS
 
 MAX_DEPTH = 100
 """Levels of a document."""
@@ -22,21 +23,12 @@ MAX_NUMBER = 1e9
 _DECLARATION = re.compile(r"""\s*<\?xml\s[^>]*?\bencoding\s*=\s*["']([\w.:-]{1,40})["'][^>]*\?>""")
 _HEAD_BYTES = 1024  # in which the XML declaration stands
 _ROOT_BYTES = 4096  # in which the root element stands
-_MARKS = (
-    (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"),
-    (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"), (b"<\0", "utf-16-le"), (b"\0<", "utf-16-be"),
-)  # fmt: skip
+_MARKS = (*BOMS, (b"<\0", "utf-16-le"), (b"\0<", "utf-16-be"))
 """First bytes of documents whose encoding they show. Source: XML 1.0, appendix F."""
-_ALIASES = {
-    "gb2312": "gb18030",
-    "gbk": "gb18030",
-    "shift_jis": "cp932",
-    "x-sjis": "cp932",
-    "euc-kr": "cp949",
-    "ks_c_5601-1987": "cp949",
-    "us-ascii": "utf-8",
-}
-"""Encodings that contain the declared ones, as programs write them. Source: WHATWG Encoding, section 4.2."""
+_LABELS = {"x-sjis": "shift_jis", "windows-31j": "cp932", "windows-874": "cp874"}
+"""Python's names of encodings that it does not know by these labels."""
+_SUPERSETS = {"ascii": "utf-8", "gb2312": "gb18030", "gbk": "gb18030", "shift_jis": "cp932", "euc_kr": "cp949"}
+"""Encodings that contain the declared ones, and that programs mean. Source: WHATWG Encoding, section 4.2."""
 _ENCODINGS = re.compile(
     r"utf-8|gb18030|cp\d{3,4}|big5(hkscs)?|euc_jp|iso2022_jp|iso8859-\d+|koi8-[rtu]|mac-\w+|tis-620"
 )
@@ -56,12 +48,13 @@ def xml_encoding(data: bytes) -> str:
     if declared is None:
         return marked or "utf-8"
     try:
-        label = declared[1].lower().replace("windows-", "cp")
-        name = codecs.lookup(_ALIASES.get(label, label)).name
+        label = declared[1].lower()
+        name = codecs.lookup(_LABELS.get(label, label)).name
     except LookupError:
         name = ""
     if name.startswith(("utf-16", "utf-32")):  # one byte a character was just read: texts of .NET that are UTF-8
         return "utf-8"
+    name = _SUPERSETS.get(name, name)
     if _ENCODINGS.fullmatch(name) is None:
         raise UnreadableUpload(
             f"the XML declares the encoding {declared[1]!r}, which is not known",
@@ -101,7 +94,7 @@ def _in_utf8(data: bytes) -> bytes:
 
 
 def check_xml(data: bytes, *, max_elements: int, cure: str) -> bytes:
-    """Check a document in one pass that builds nothing: depth, number of elements, no document type.
+    """The document in UTF-8, checked in one pass that builds nothing: depth, number of elements, no document type.
 
     Returns
     -------
@@ -142,22 +135,15 @@ def check_xml(data: bytes, *, max_elements: int, cure: str) -> bytes:
     parser.EndElementHandler = end
     try:
         parser.Parse(data, True)
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: unknown encodings
+    except (expat.ExpatError, ValueError) as error:
         message, cure = f"not XML: {error}", "export it again"
-        if (wrong := _not_utf8(data)) is not None:
-            message = f"not XML: byte {wrong + 1} is not UTF-8, and the file declares no other encoding"
+        try:
+            data.decode("utf-8")
+        except UnicodeDecodeError as wrong:
+            message = f"not XML: byte {wrong.start + 1} is not UTF-8, and the file declares no other encoding"
             cure = "save the file in UTF-8, or state its encoding in its first line"
         raise UnreadableUpload(message, field="file", limit="XML 1.0", cure=cure) from error
     return data
-
-
-def _not_utf8(data: bytes) -> int | None:
-    """Place of the first byte that is not UTF-8."""
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        return error.start
-    return None
 
 
 def parse_xml(data: bytes, root: str) -> ET.Element:

@@ -87,6 +87,7 @@ def named_system(name: str) -> CRS:
     return system
 
 
+@lru_cache(maxsize=64)
 def system_of_wkt(wkt: str) -> tuple[CRS, str]:
     """A projected system that the EPSG registry does not list, such as a county's grid, and what it projects from.
 
@@ -110,11 +111,26 @@ def system_of_wkt(wkt: str) -> tuple[CRS, str]:
     base = system.geodetic_crs
     if not system.is_projected or system.is_compound or system.is_bound or base is None or "EXTENSION[" in wkt.upper():
         raise _unusable_wkt(f"{shown} and is not a plain projected system")
+    code = geographic_code(base)
+    if code is None:
+        raise _unusable_wkt(f"{shown} and its datum {base.name[:60]!r} is not in the EPSG registry either")
+    return system, code
+
+
+def geographic_code(base: CRS) -> str | None:
+    """``EPSG:code`` of the geographic system that has the datum of another one, by the datum's name in the registry."""
+    datum = _datum_name(base)
     for listed in base.list_authority("EPSG", min_confidence=25):
-        known = named_system(f"EPSG:{listed.code}")
-        if base.datum is not None and known.datum is not None and known.datum.name == base.datum.name:
-            return system, f"EPSG:{listed.code}"
-    raise _unusable_wkt(f"{shown} and its datum {base.name[:60]!r} is not in the EPSG registry either")
+        known = CRS.from_epsg(int(listed.code))  # the geocentric system of the datum is among them
+        if known.is_geographic and len(known.axis_info) == 2 and _datum_name(known) == datum:
+            return f"EPSG:{listed.code}"
+    return None
+
+
+def _datum_name(system: CRS) -> str:
+    """Name of a datum; files that were written before there were ensembles have it without that word."""
+    assert system.datum is not None
+    return system.datum.name.removesuffix(" ensemble")
 
 
 def _unusable_wkt(message: str) -> ReferenceSystemError:

@@ -83,7 +83,8 @@ _CONTRADICTED = (
 _MIN_CONTRADICTED = 2  # a single marker may have been moved
 _MIN_FIXES = 10  # of the track in the lane to which the vehicle changed
 _MAX_GAP_M = 25.0  # [m] without a marker of the driven lane, beside markers of others; two spacings
-_MIN_SHARE, _LONG_M = 0.25, 100.0  # of the drive past markers, that a path covers which is not that long [m]
+_MIN_COVERED_SHARE, _MIN_COVERED_M = 0.25, 100.0  # [1, m] of the drive past markers
+"""A path that covers less than both is of a road that crosses."""
 _MIN_OWN_SHARE = 0.15  # of the markers that were received; two of the eight lines of a motorway are a quarter
 _MAX_ACROSS_M = 1.6  # [m] that an accurate track moves across its lane; half of a lane
 _MAX_WITHIN = 2  # markers between the boundaries of a path: of a road that crosses, or spoofed
@@ -440,7 +441,7 @@ def _fit_driven_lane(
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
     if not drive.accuracy_m < TRUSTED_TRACK_M and _widest_gap_m(lane, observations) > _MAX_GAP_M:
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
-    crosses = float(np.ptp(lane.station_m)) < min(_MIN_SHARE * float(np.ptp(along[taken])), _LONG_M)
+    crosses = float(np.ptp(lane.station_m)) < min(_MIN_COVERED_SHARE * float(np.ptp(along[taken])), _MIN_COVERED_M)
     if crosses or (lane.side != UNKNOWN).sum() < _MIN_OWN_SHARE * taken.sum():
         return refused_path(observations, notes, _NOT_ALONG, "waymark")
     stretches = _stretches(lane, course, drive) if course.lane.any() else ()

@@ -42,7 +42,8 @@ _OUTLIER_SIGMAS = 3.0  # from which on a fix counts less (Huber)
 _GAP_S, _CONVERGING_S = 3.0, 15.0  # [s] without a fix, as in a tunnel, and how long positions are inaccurate after it
 _MIN_CONVERGED = 0.5  # share of fixes, below which inaccurate ones are used, too
 _PRECISE_M = 0.3  # [m] of a receiver that shows whether a vehicle is in its lane
-_PARALLEL, _MAX_PARALLEL_SHARE = 0.26, 0.1  # sine of 15 degrees; of the fixes, three or more of a usual drive
+_PARALLEL_SINE = 0.26  # of 15 degrees, the largest angle to the path of fixes that count as parallel
+_MAX_PARALLEL_SHARE = 0.1  # of the fixes; three or more of a usual drive
 _BESIDE_LANE_M = 0.5  # [m] from a boundary
 _BODY_M = 1.0  # [m] half of a car with its mirrors; its driver keeps it between the boundaries
 _MIN_LEAVES_M, _MIN_LEAVES_SIGNIFICANCE = 0.65, 2.5  # [m, 1] a path so far from a vehicle is not that of its lane
@@ -131,8 +132,8 @@ def _fixes(lane: Lane, track: PoseTrack) -> Floats:
 def _in_lane(lane: Lane, tree: scipy.spatial.cKDTree, fixes_m: Floats, half_width_m: float) -> Bools:
     """Fixes of a vehicle that has not left its lane, as for overtaking; all of them, if it was hardly in one.
 
-    All of them, too, where it runs parallel to the lane farther away than it overtakes: then the lane is not in its
-    place. A vehicle that turns off does not run parallel.
+    Also all of them, where more than a tenth run parallel to the path, farther away than a vehicle that overtakes: the
+    path is then in the wrong place. A vehicle that turns off does not run parallel.
     """
     if len(fixes_m) < 2:
         return np.ones(len(fixes_m), bool)
@@ -142,7 +143,7 @@ def _in_lane(lane: Lane, tree: scipy.spatial.cKDTree, fixes_m: Floats, half_widt
     inside = away_m < half_width_m + _BESIDE_LANE_M
     ahead = np.gradient(fixes_m, axis=0)
     across = np.abs(np.sum(_normals(lane, at) * ahead, 1)) / np.maximum(np.hypot(*ahead.T), 1e-9)
-    if np.mean((away_m > 3 * half_width_m + _BESIDE_LANE_M) & (across < _PARALLEL)) > _MAX_PARALLEL_SHARE:
+    if np.mean((away_m > 3 * half_width_m + _BESIDE_LANE_M) & (across < _PARALLEL_SINE)) > _MAX_PARALLEL_SHARE:
         return np.ones(len(inside), bool)
     return inside if inside.mean() >= _MIN_CONVERGED else np.ones(len(inside), bool)
 

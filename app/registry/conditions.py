@@ -160,8 +160,8 @@ def holds(condition: Condition, values: Mapping[str, object]) -> bool | None:
     """
     match condition:
         case Located(area, strictly):
-            shape, found = values[GEOMETRY], shapely.from_wkb(area.wkb)
-            return bool(shapely.within(shape, found) if strictly else shapely.intersects(shape, found))
+            shape = values[GEOMETRY]
+            return bool(shapely.contains(area.shape, shape) if strictly else shapely.intersects(area.shape, shape))
         case Constant(value):
             return value
         case Missing(name):

@@ -194,7 +194,7 @@ class Box:
 
 
 class _PreparedArea:
-    """Polygons that points are compared with."""
+    """A shape that points are compared with."""
 
     def __init__(self, wkb: bytes) -> None:
         self._wkb = wkb
@@ -208,7 +208,7 @@ class _PreparedArea:
 
 
 _PREPARED: WeakValueDictionary[bytes, _PreparedArea] = WeakValueDictionary()
-"""Polygons of all areas that are in use, by `Area.key`."""
+"""Shapes of all areas that are in use, by `Area.key`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,10 +222,15 @@ class Area:
     _prepared: _PreparedArea = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Share the prepared polygons with equal areas; they are kept as long as one of these is."""
+        """Share the prepared shape with equal areas; it is kept as long as one of these is."""
         key = hashlib.blake2b(self.wkb, digest_size=16).digest()
         object.__setattr__(self, "key", key)
         object.__setattr__(self, "_prepared", _PREPARED.setdefault(key, _PreparedArea(self.wkb)))
+
+    @property
+    def shape(self) -> shapely.Geometry:
+        """All parts as one geometry, prepared for many comparisons."""
+        return self._prepared.shape
 
 
 def box_around(lon_deg: float, lat_deg: float, radius_m: float) -> Box:
@@ -289,7 +294,7 @@ def _by_gist(element: _Proposed, compiler: SQLCompiler, **how: object) -> str:
 
 
 def within_box(box: Box, table: sa.Table = markers) -> sa.ColumnElement[bool]:
-    """Rows of `markers` or `magnets` inside a box: the index finds candidates, the exact columns decide."""
+    """Rows of a table with a spatial index inside a box: the index finds candidates, the exact columns decide."""
     return sa.or_(*(_within_part(part, table) for part in box.parts))
 
 

@@ -30,6 +30,19 @@ _SLACK_M = 30.0  # [m] jump of a receiver that is no outlier
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
 
+@dataclass(frozen=True, slots=True)
+class PosePoint:
+    """One position of a vehicle, as a file has it."""
+
+    entry: int  # row, line or point of the file, from 0
+    time_s: float  # [s] seconds since 1970-01-01 UTC; NaN where it is not known
+    # `lon_deg`, `lat_deg`, `heading_deg`, `accuracy_m`: as in `PoseTrack`
+    lon_deg: float
+    lat_deg: float
+    heading_deg: float = math.nan
+    accuracy_m: float = math.nan
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTrack:
     """A vehicle's own positions over time.

@@ -18,6 +18,8 @@ NAMES = {
     "Shift_JIS": "国道１号①",
     "EUC-JP": "国道",
     "EUC-KR": "세종대로",
+    "ks_c_5601-1987": "세종대로",
+    "windows-31j": "東名高速①",
     "windows-1251": "Тверская",
     "KOI8-R": "Тверская",
     "ISO-8859-15": "Straße 3 €",
@@ -26,7 +28,11 @@ NAMES = {
     "UTF-16": "科技路",
     "UTF-8": "科技路",
 }
-_PYTHON = {"Shift_JIS": "cp932"}  # what programs on Windows write under this name
+_PYTHON = {
+    "Shift_JIS": "cp932",
+    "windows-31j": "cp932",
+    "ks_c_5601-1987": "cp949",
+}  # what programs on Windows write under this name
 
 
 def _encoded(text: str, encoding: str) -> bytes:
@@ -89,7 +95,7 @@ def test_wide_characters_with_and_without_a_mark(encoding: str, declared: str) -
         assert read_alignment(text.encode(encoding)).lanes[0].road == "科技路"
 
 
-@pytest.mark.parametrize("declared", ["utf-16", "us-ascii", "UTF8", "utf-8"])
+@pytest.mark.parametrize("declared", ["utf-16", "us-ascii", "ASCII", "UTF8", "utf-8"])
 def test_utf_8_under_another_name(declared: str) -> None:
     """.NET writes texts as UTF-16 in the declaration, and programs save them in UTF-8."""
     text = f'<?xml version="1.0" encoding="{declared}"?>{_opendrive("科技路")}'

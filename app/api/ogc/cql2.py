@@ -31,6 +31,7 @@ from app.registry.conditions import (
     Value,
 )
 from app.registry.spatial import Area
+from app.values import JsonObject
 
 LANGUAGES = ("cql2-text", "cql2-json", "cql-text")
 MAX_DEPTH = 20
@@ -94,11 +95,11 @@ class Reader:
             It cannot be read, or is about a property or a kind of value that there is not.
         """
         condition = _Json(self).read(expression) if language == "cql2-json" else _Text(self, expression).read()
-        if _size(condition) > MAX_CONDITIONS:
+        if _count(condition) > MAX_CONDITIONS:
             refuse_filter("the filter has too many conditions", f"{MAX_CONDITIONS} conditions")
-        if (places := _size(condition, Located)) > MAX_SPATIAL:
+        if (places := _count(condition, lambda one: isinstance(one, Located))) > MAX_SPATIAL:
             refuse_filter(f"the filter has {places} spatial conditions", f"{MAX_SPATIAL} of them")
-        patterns = _size(condition, "like")
+        patterns = _count(condition, lambda one: isinstance(one, Compared) and one.operator == "like")
         if patterns > MAX_PATTERNS:
             refuse_filter(
                 f"the filter has {patterns} conditions with LIKE",
@@ -150,15 +151,13 @@ def refuse_filter(message: str, limit: str, cure: str = "/ogc/api describes the 
     raise MalformedRequest(message, field="filter", limit=limit, cure=cure)
 
 
-def _size(condition: Condition, symbol: str | type[Located] | None = None) -> int:
-    """How many conditions are joined: all, the spatial ones, or the comparisons by one operator."""
+def _count(condition: Condition, counts: Callable[[Condition], bool] = lambda _condition: True) -> int:
+    """How many of the conditions that are joined count."""
     if isinstance(condition, Joined):
-        return sum(_size(inner, symbol) for inner in condition.conditions)
+        return sum(_count(inner, counts) for inner in condition.conditions)
     if isinstance(condition, Not):
-        return _size(condition.condition, symbol)
-    if symbol is None or isinstance(symbol, type):
-        return int(symbol is None or isinstance(condition, symbol))
-    return int(isinstance(condition, Compared) and condition.operator == symbol)
+        return _count(condition.condition, counts)
+    return int(counts(condition))
 
 
 def distance_m(distance: float, unit: object) -> float:
@@ -418,7 +417,7 @@ class _Json:
             f"{', '.join(name.lower() for name in SPATIAL)}",
         )
 
-    def _located(self, operator: str, name: str, shape: dict[str, Any], more: list[object]) -> Condition:
+    def _located(self, operator: str, name: str, shape: JsonObject, more: list[object]) -> Condition:
         match operator, more:
             case "S_DWITHIN", [int() | float() as distance, unit]:
                 within_m = distance_m(self._reader.number(repr(distance)), unit)

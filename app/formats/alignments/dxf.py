@@ -39,6 +39,7 @@ from app.formats.alignments.geometry import (
 )
 from app.formats.surveys.declaration import METRES
 from app.formats.surveys.dxf_reader import drawn_entities, hidden_layers, open_dxf, reading_dxf
+from app.formats.text import count_of
 from app.values import Floats
 
 NAME_DISTANCE_M = 10.0
@@ -113,26 +114,33 @@ class _Blocks:
         """Sentences about what is left out."""
         if self.external:
             yield (
-                f"{len(self.external)} references to other drawings are left out, the first is "
+                f"{count_of(len(self.external), 'reference')} to other drawings left out, the first is "
                 f"{self.external[0][:80]}; bind them (XREF, Bind) and export the drawing again."
             )
         if self.symbols:
             yield (
-                f"{len(self.symbols)} block references are smaller than {SYMBOL_M:g} m and are taken as symbols; lines "
-                f"in them are left out. The first is {self.symbols[0][:80]}."
+                f"{count_of(len(self.symbols), 'block reference')} smaller than {SYMBOL_M:g} m left out as symbols, "
+                f"the first is {self.symbols[0][:80]}."
             )
         if self.clipped:
             yield (
-                f"{len(self.clipped)} block references are clipped (XCLIP), the first is {self.clipped[0][:80]}; they "
-                "were read whole."
+                f"{count_of(len(self.clipped), 'clipped block reference')} (XCLIP) read whole, the first is "
+                f"{self.clipped[0][:80]}."
             )
 
 
 def _symbol_size(block: Any) -> float:
-    """Diagonal of a block; infinite if it cannot be a symbol, because of its size or of layers of areas or events."""
+    """Diagonal of a block; infinite if it cannot be a symbol, because of its size or of layers of areas or events.
+
+    A symbol holds other blocks once and one level deep, so that few entities are measured.
+    """
     from ezdxf import bbox
 
-    if len(block) > _SYMBOL_ENTITIES:
+    inner = [entity for entity in block if entity.dxftype() == "INSERT"]
+    blocks = [one.block() or () for one in inner]
+    if any(one.mcount > 1 for one in inner) or any(entity.dxftype() == "INSERT" for one in blocks for entity in one):
+        return math.inf
+    if len(block) + sum(len(one) for one in blocks) > _SYMBOL_ENTITIES:
         return math.inf
     kinds = {normalize_kind(_own_name(str(entity.dxf.layer))) for entity in block}
     if any(kind in EVENT_KINDS or area_kind(kind) in AREA_KINDS for kind in kinds):
@@ -193,7 +201,9 @@ def read_dxf(data: bytes, declaration: AlignmentDeclaration | None = None) -> Al
             )
     if others:
         kinds = " and ".join(dict.fromkeys(_OTHER_CURVES[kind] for kind, _layer in others))
-        notes.append(f"{len(others)} {kinds} are left out, the first on layer {others[0][1]}; export them as polylines")
+        notes.append(
+            f"left out: {kinds} ({len(others)} in all), the first on layer {others[0][1]}; export them as polylines"
+        )
     features = list(_features(paths, labels, unit_m or 1.0))
     return assemble_road("dxf", features, unit_m=unit_m, warnings=notes)
 

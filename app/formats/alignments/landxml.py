@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -32,7 +32,7 @@ from app.formats.alignments.geometry import (
     StationEquation,
     unit_length_m,
 )
-from app.formats.surveys.declaration import FEET
+from app.formats.surveys.declaration import FEET, METRES
 from app.formats.xml_tree import attribute, finite_number, parse_xml
 from app.geodesy import reference_system
 from app.values import Floats, Ints
@@ -42,8 +42,13 @@ UNITS = {
     "inch": (FEET, 1 / 12), "foot": (FEET, 1.0), "ussurveyfoot": ("ft-us", 1.0), "mile": (FEET, 5280.0),
 }  # fmt: skip
 """Unit of length of each linear unit, and how many of it that is. Source: LandXML 1.2, metLinear and impLinear."""
-_CLEARLY = 0.25  # of two misfits the smaller one decides if it is less than this part of the other
-_NOTHING = 1e-3  # smaller misfits decide nothing, in rad or as a part of the length; coordinates are rounded
+_HEIGHT_UNITS = {"meter": 1.0, "kilometer": 1000.0, "feet": METRES["ft-intl"], "foot": METRES["ft-intl"],
+                 "miles": 5280.0 * METRES["ft-intl"]}  # fmt: skip
+"""Source: LandXML 1.2, elevationType. [m]"""
+_FEET = ("feet", "foot")  # which foot they are is that of the lengths
+_MAX_MISFIT_RATIO = 0.25  # of two misfits the smaller one decides if it is below this share of the larger one
+_MIN_MISFIT = 1e-3  # in rad, or as a share of the length; smaller ones are the rounding of coordinates
+_MISSING_M = 1.0  # [m] of a line that its profile may leave out without a warning
 _TANGENT_RAD = 0.01  # lines and curves that meet with a smaller angle are tangents
 _CURE = "correct the element at this place, or export the alignment again"
 Point = tuple[float, float]
@@ -55,8 +60,9 @@ class _Scale:
     """Coordinates of the file from metres about an origin near the road."""
 
     unit_m: float
+    height_unit_m: float
     origin: tuple[float, float]  # northing and easting in the unit of the file
-    named: dict[str, str]  # texts of CgPoints by name
+    named: dict[str, set[str]]  # texts of CgPoints by name; of a name that is used twice there may be several
 
     def length(self, element: ET.Element, name: str, place: str) -> float:
         return attribute(element, name, place) * self.unit_m
@@ -66,7 +72,17 @@ class _Scale:
         child = element.find(tag)
         if child is None:
             return None
-        text = self.named.get(child.get("pntRef", ""), "") if child.get("pntRef") else child.text or ""
+        text = child.text or ""
+        if child.get("pntRef"):
+            texts = self.named.get(child.get("pntRef", ""), set())
+            if len(texts) > 1:
+                raise _wrong(
+                    f"{place}: {tag} refers to {child.get('pntRef', '')[:40]!r}, and points of this name are at "
+                    f"{len(texts)} places",
+                    "one place for each CgPoint that an alignment refers to",
+                    "give the points different names, or export the alignment with coordinates",
+                )
+            text = next(iter(texts), "")
         parts = text.split()
         if len(parts) < 2:
             raise _wrong(f"{place}: {tag} is {text.strip()[:40]!r}", "northing and easting")
@@ -96,10 +112,12 @@ def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -
         It is no LandXML, is damaged, contradicts itself, or has unknown elements; the message names the place.
     """
     root = parse_xml(data, "LandXML")
-    named = {point.get("name", ""): point.text or "" for point in root.iter("CgPoint")}
+    named: dict[str, set[str]] = {}
+    for point in root.iter("CgPoint"):
+        named.setdefault(point.get("name", ""), set()).add(" ".join((point.text or "").split()))
     crs, problem = _crs(root)
     unit_m, warnings = unit_length_m(_unit(root), declaration or AlignmentDeclaration(), crs)
-    scale = _Scale(unit_m, (0.0, 0.0), named)
+    scale = _Scale(unit_m, _height_unit_m(root, unit_m), (0.0, 0.0), named)
     lanes: list[LaneGeometry] = []
     stations: list[tuple[float, tuple[StationEquation, ...]]] = []
     vertices = 0
@@ -111,14 +129,14 @@ def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -
             warnings.append(f"{place}: it has no CoordGeom; it is left out.")
             continue
         if not lanes:
-            scale = _Scale(scale.unit_m, _first_point(shape, scale, place), named)
+            scale = replace(scale, origin=_first_point(shape, scale, place))
         start = attribute(element, "staStart", place, 0.0)
         curve = _curve(shape, scale, place, warnings)
         if curve is None:
             warnings.append(f"{place}: its elements have no length; it is left out.")
             continue
         stations.append((start * scale.unit_m, _equations(element, start, curve.end_s, scale, place, warnings)))
-        lane = _lane(curve, _profile(element, start, scale, place, warnings), scale, name)
+        lane = _lane(curve, _profile(element, start, curve.end_s, scale, place, warnings), scale, name)
         vertices += 0 if lane.station_m is None else len(lane.station_m)
         if vertices > MAX_VERTICES:
             raise _wrong("the alignments need too many vertices", f"{MAX_VERTICES} vertices", "cut the file into parts")
@@ -155,6 +173,18 @@ def _unit(root: ET.Element) -> tuple[str, float]:
         state = f"the linear unit {name[:40]!r} is not known" if name else "the file states no linear unit"
         raise _wrong(state, ", ".join(UNITS), "export the file with Units in metres or feet")
     return unit
+
+
+def _height_unit_m(root: ET.Element, unit_m: float) -> float:
+    """Unit of the elevations, where the file states another one than that of lengths. [m]"""
+    units = next((child for child in root.iterfind("Units/*") if child.get("elevationUnit")), None)
+    name = "" if units is None else units.get("elevationUnit", "").lower()
+    if not name:
+        return unit_m
+    if name not in _HEIGHT_UNITS:
+        raise _wrong(f"the unit of elevations {name[:40]!r} is not known", ", ".join(_HEIGHT_UNITS))
+    is_feet = abs(unit_m / METRES["ft-intl"] - 1.0) < 1e-5
+    return unit_m if name in _FEET and is_feet else _HEIGHT_UNITS[name]
 
 
 def _crs(root: ET.Element) -> tuple[str | None, str | None]:
@@ -292,7 +322,7 @@ def _tangent_side(shapes: list[_Shape], i: int) -> int | None:
 def _smaller(misfits: list[float]) -> int | None:
     """Which of two misfits is clearly the smaller one; None if neither is, or if there is only one."""
     low, high = min(misfits), max(misfits)
-    return misfits.index(low) if high > _NOTHING and low < _CLEARLY * high else None
+    return misfits.index(low) if high > _MIN_MISFIT and low < _MAX_MISFIT_RATIO * high else None
 
 
 Read = Callable[[ET.Element, Point, Point, _Scale, str, list[str]], _Shape]
@@ -339,7 +369,7 @@ def _read_curve(
         first, last = (math.atan2(point[1] - centre[1], point[0] - centre[0]) for point in (start, end))
     else:
         radius = scale.length(element, "radius", place)
-    if not 0.0 < chord <= 2.0 * radius + GAP_M:
+    if radius <= 0.0 or not 0.0 < chord <= 2.0 * radius + GAP_M:
         raise _wrong(
             f"{place}: no arc of radius {radius / scale.unit_m:g} joins Start and End",
             "a radius of half the distance of Start and End at least, which differ",
@@ -450,7 +480,9 @@ def _equations(
     return tuple(found)
 
 
-def _profile(alignment: ET.Element, start: float, scale: _Scale, place: str, warnings: list[str]) -> Profile | None:
+def _profile(
+    alignment: ET.Element, start: float, length_m: float, scale: _Scale, place: str, warnings: list[str]
+) -> Profile | None:
     """The first designed profile; surveyed ones (ProfSurf) are not used."""
     designs = alignment.findall("Profile/ProfAlign")
     if len(designs) > 1:
@@ -474,9 +506,17 @@ def _profile(alignment: ET.Element, start: float, scale: _Scale, place: str, war
             lengths = scale.length(element, "lengthIn", where), scale.length(element, "lengthOut", where)
         elif element.tag == "CircCurve":
             radius = abs(scale.length(element, "radius", where))
-        height = finite_number(parts[1], "the elevation", where) * scale.unit_m
+        height = finite_number(parts[1], "the elevation", where) * scale.height_unit_m
         points.append(VerticalPoint(where, station, height, *lengths, radius))
-    return build_profile(points) if points else None
+    if not points:
+        return None
+    missing_m = max(points[0].s, 0.0), max(length_m - points[-1].s, 0.0)
+    if max(missing_m) > _MISSING_M:
+        warnings.append(
+            f"{place}: the profile begins {missing_m[0]:.1f} m after the line's start and ends {missing_m[1]:.1f} m "
+            "before its end; the road has no heights of its own there."
+        )
+    return build_profile(points)
 
 
 def _lane(curve: Curve, profile: Profile | None, scale: _Scale, name: str) -> LaneGeometry:

@@ -18,7 +18,8 @@ from app.formats.bags.messages import FIELD, Bag, BagKind, Topic, describe_topic
 from app.formats.format import SpooledFile
 from app.formats.images import ImageLimits, inspect_image, load_image
 from app.formats.logs import LogReport
-from app.formats.poses import PosePoint, track_of
+from app.formats.poses import track_of
+from app.formats.text import count_of
 from app.formats.video_file import (
     PictureFrame,
     ReadReport,
@@ -30,7 +31,7 @@ from app.formats.video_file import (
     cut_segments,
     find_time_gaps,
 )
-from app.sensors.pose_track import PoseTrack
+from app.sensors.pose_track import PosePoint, PoseTrack
 from app.values import Floats
 
 # === Pictures of bags: compressed ones, and raw ones with their rows of bytes.
@@ -241,8 +242,8 @@ def index_bag(file: VideoFile, limits: VideoLimits) -> VideoIndex:
     _compare_clocks(pictures, by_stamp, warnings)
     frame_ns, recorded_ns = _rising(pictures.stamp_ns if by_stamp else pictures.recorded_ns, pictures.recorded_ns)
     if len(frame_ns) < len(listed):
-        left_out = len(listed) - len(frame_ns)
-        warnings.append(f"{left_out} pictures have the time of another one, or are out of order; they are left out")
+        left_out = count_of(len(listed) - len(frame_ns), "picture")
+        warnings.append(f"{left_out} left out, with the time of another one or out of order")
     if not _SINCE_NS <= frame_ns[0] < _UNTIL_NS:
         raise UnreadableUpload(
             "the bag's pictures have no time between 2000 and 2100", field=FIELD, cure="record with the clock set"
@@ -344,8 +345,8 @@ def _choose_receiver(bag: Bag, warnings: list[str]) -> _Receiver | None:
     found = [_read_receiver(bag, topic.name) for topic in bag.topics if topic.type_name in FIXES]
     found.sort(key=lambda one: (-len(one.points), _median_accuracy_m(one.points), one.topic))
     for other in found[1:] if found and found[0].points else found:
-        used = f"; {found[0].topic} is used, which holds {len(found[0].points)}" if found[0].points else ""
-        warnings.append(f"positions held by {other.topic}: {len(other.points)}{used}")
+        used = f"; {found[0].topic} is used, with {len(found[0].points)}" if found[0].points else ""
+        warnings.append(f"{other.topic} holds {count_of(len(other.points), 'position')}{used}")
     return found[0] if found and found[0].points else None
 
 
@@ -381,7 +382,7 @@ def _track_of(receiver: _Receiver | None, by_stamp: bool, warnings: list[str]) -
         return None
     if report.left_out_count:
         reason = report.left_out[0].reason
-        warnings.append(f"{receiver.topic}: {report.left_out_count} positions were left out ({reason})")
+        warnings.append(f"{receiver.topic}: {count_of(report.left_out_count, 'position')} left out ({reason})")
     return track
 
 

@@ -11,10 +11,13 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.format import SpooledFile
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 FIELD = "file"
 MAX_CHUNK_BYTES = 256 * 1024**2
@@ -119,7 +122,7 @@ class Bag:
     def __init__(self, kind: BagKind, reader: Any) -> None:
         self._kind, self._reader = kind, reader
         self.topics: list[Topic] = list(self._list_topics())
-        self._types: dict[str, Any] = {}
+        self._types: dict[str, Typestore] = {}  # by encoding
 
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None

@@ -18,7 +18,6 @@ from app.formats.packets.rows import (
     BrokenEntry,
     PacketSource,
     PayloadText,
-    note_unread_time,
     packet_from_values,
     payload_text,
     read_payload,
@@ -566,7 +565,7 @@ def _packet_from_record(
     values.setdefault("time", outer_time)
     written = payload_text(names[places["payload"]] if "payload" in places else "", declaration)
     packet = packet_from_values(entry, values, declaration.times, written)
-    note_unread_time(packet, values, source.report)
+    source.report.note_unread_time(values.get("time"), packet.received_at_s)
     return packet
 
 

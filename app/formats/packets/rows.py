@@ -244,12 +244,6 @@ def _speed_limit(values: Mapping[str, object], decimal: str) -> SpeedLimit | Non
     return None
 
 
-def note_unread_time(packet: ReceivedPacket, values: Mapping[str, object], report: LogReport) -> None:
-    """Remember the first text or number that should be a time and is none that can be read."""
-    if report.unread_time is None and math.isnan(packet.received_at_s) and values.get("time") not in (None, ""):
-        report.unread_time = clean_text(str(values["time"]), 40)
-
-
 def warn_untimed(report: LogReport, packets: int, untimed: int) -> None:
     """Warn about packets without a time."""
     if not untimed:
@@ -345,7 +339,7 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
     if "time" not in places:
         report.warn(
             f"{source.sample.name} has no column that is named as a time; its columns are {_shown(log.columns)}: "
-            "declare columns.time if one of them is"
+            "declare columns.time if one of them holds times"
         )
     else:
         texts = (cells[places["time"]] for cells in log.rows() if cells is not None)
@@ -358,7 +352,7 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
             values = {quantity: cells[place] for quantity, place in places.items()}
             zoned = zoned and _names_zone(values.get("time", ""))
             packet = packet_from_values(entry, values, clock, written, decimal=log.dialect.decimal)
-            note_unread_time(packet, values, report)
+            report.note_unread_time(values.get("time"), packet.received_at_s)
             yield packet
         except BrokenEntry as broken:
             report.leave_out(entry, broken.kind, broken.reason)

@@ -31,8 +31,8 @@ from app.formats.surveys.table import (
     read_sexagesimal,
     warn,
 )
-from app.geodesy import reference_system
-from app.geodesy.systems import best_effort
+from app.geodesy import normalize_crs, reference_system
+from app.geodesy.systems import best_effort, covers
 from app.values import Floats, JsonObject
 
 # === Grids of projected systems: their unit, and eastings that begin with the number of the zone.
@@ -118,6 +118,27 @@ def without_zone(easting: Floats, system: CRS) -> tuple[Floats, int | None]:
     return easting, None
 
 
+def share_inside(easting: Floats, northing: Floats, declaration: ImportDeclaration) -> float:
+    """Share of the positions that lie in the declared area and the area of use of the declared CRS. [1]
+
+    Parameters
+    ----------
+    easting, northing : ndarray, shape (N,)
+        In the declared unit; N is at least 1.
+    """
+    name = normalize_crs(declaration.crs)
+    system = reference_system(name)
+    factor = unit_factor(declaration.unit, system)
+    easting, _zone = without_zone(easting * factor, system)
+    lon, lat = (np.asarray(v) for v in best_effort(name).transform(easting, northing * factor))
+    with np.errstate(invalid="ignore"):
+        inside = np.isfinite(lon) & np.isfinite(lat) & (np.abs(lat) <= 90) & covers(system.area_of_use, lon, lat)
+        if declaration.area_deg is not None:
+            west, south, east_deg, north_deg = declaration.area_deg
+            inside &= (lon >= west) & (lon <= east_deg) & (lat >= south) & (lat <= north_deg)
+    return float(inside.mean())
+
+
 # === Coordinates of a table.
 
 
@@ -131,6 +152,11 @@ _AGREE_M = 5.0
 (1 to 2 m) and the rounding of five decimals of a degree, below NAD27 or ED50 (30 to 200 m)."""
 _IGNORED = (Change("ignore_heights", True),)
 _FEW = 4  # rows whose heights may be equal by chance
+_MIN_SHARE = 0.5  # [1] of the rows that must lie in an area for their order to be possible
+_SYSTEM_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "datum", "coordinatesystem", "koordinatensystem")
+_ZONE_NAMES = ("zone", "utmzone", "gridzone")
+_SYSTEM_VALUE = re.compile(r"[A-Z]|[0-9]{4,6}$", re.IGNORECASE)  # dates, which Datum is in German, are no systems
+_ZONE_VALUE = re.compile(r"[0-9]{1,2} ?[A-Z]?$", re.IGNORECASE)
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
 
@@ -180,6 +206,9 @@ def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places
         group = _BLANKS.get(form.group, form.group)
         value = form.decimal + (f", with {group} between groups of three digits" if form.group else "")
         read.detected.append(Detected("decimal sign", value, f"most numbers are written like {shown!r}"))
+    if pair == PAIRS[1]:
+        _check_order(source, declaration, places, first, second)
+    _check_one_system(source, set(places.values()))
     if pair == PAIRS[1] and None not in (places["lon_deg"], places["lat_deg"]):
         lon, lat = (_numbers(source, places, role, form, is_sexagesimal)[0] for role in PAIRS[0])
         assert lon is not None
@@ -276,6 +305,53 @@ def _holds_numbers(role: str) -> bool:
     return role in NUMBER_ROLES or role == "height" or any(role in pair for pair in PAIRS)
 
 
+def _check_order(
+    source: SourceTable, declaration: ImportDeclaration, places: dict[str, int | None], first: Floats, second: Floats
+) -> None:
+    """Refuse columns X and Y that nothing orders: in many national systems X is the northing, GIS software differs."""
+    x, y = (source.names[place].strip() for role in PAIRS[1] if (place := places[role]) is not None)
+    is_declared = any(role in declaration.columns for role in PAIRS[1]) or declaration.local_grid is not None
+    if is_declared or declaration.crs is None or not plain_name(x).startswith("x"):
+        return
+    axes = reference_system(declaration.crs).axis_info
+    if not any(axis.abbrev.upper() == "X" and axis.direction == "north" for axis in axes):
+        return
+    known = np.isfinite(first) & np.isfinite(second)
+    pairs = ((first[known], second[known]), (second[known], first[known]))
+    if known.any() and all(share_inside(*pair, declaration) > _MIN_SHARE for pair in pairs):
+        raise InvalidParameter(
+            f"the columns {x!r} and {y!r} can be read in both orders: X is the northing of {declaration.crs}, GIS"
+            " software writes the easting there, and the rows lie in its area of use either way",
+            field="columns",
+            limit="columns.easting and columns.northing, or area_deg",
+            cure=f'declare columns {{"easting": "{y}", "northing": "{x}"}} if {x} is the northing, else the reverse',
+        )
+
+
+def _check_one_system(source: SourceTable, used: set[int | None]) -> None:
+    """Refuse rows in several systems; a column that has a role is no column of systems.
+
+    Raises
+    ------
+    InvalidParameter
+        A column of codes, datums or zones has several values.
+    """
+    for column, name in enumerate(source.names):
+        plain = plain_name(name)
+        if column in used or plain not in (*_SYSTEM_NAMES, *_ZONE_NAMES):
+            continue
+        values = sorted({text for value in source.columns[column] if (text := cell_text(value))})
+        form = _ZONE_VALUE if plain in _ZONE_NAMES else _SYSTEM_VALUE
+        if len(values) > 1 and all(map(form.match, values)):
+            shown = ", ".join(text[:30] for text in values[:_FEW])
+            raise InvalidParameter(
+                f"the rows are in several systems: the column {name.strip()[:40]!r} has {shown}",
+                field="crs",
+                limit="one CRS a file",
+                cure=f'send a file for each; if it is no CRS, declare columns {{"description": "{name.strip()[:40]}"}}',
+            )
+
+
 # --- geometry -------------------------------------------------------------------------------------------------------
 
 
@@ -294,7 +370,18 @@ def _from_wkt(source: SourceTable, column: int) -> Coordinates:
     is_hex = first[0] == "0"
     read: Any = shapely.from_wkb if is_hex else shapely.from_wkt
     shapes = read([text if is_hex else _SRID.sub("", text) for text in texts], on_invalid="ignore")
-    srid = int(shapely.get_srid(read(first))) if is_hex else int(found[1]) if (found := _SRID.match(first)) else 0
+    if is_hex:
+        srids = {int(srid) for srid, shape in zip(shapely.get_srid(shapes), shapes, strict=True) if shape is not None}
+    else:
+        srids = {int(found[1]) if (found := _SRID.match(text)) else 0 for text in texts if text}
+    if len(srids) > 1:
+        raise InvalidParameter(
+            f"the geometries have several SRIDs: {', '.join(str(srid or 'none') for srid in sorted(srids)[:_FEW])}",
+            field="crs",
+            limit="one CRS a file",
+            cure="send a file for each, or transform all with ST_Transform",
+        )
+    srid = next(iter(srids), 0)
     (x, y, z), faults = points_of(shapes)
     evidence = f"the column {source.names[column][:60]!r} holds {'WKB' if is_hex else 'WKT'} such as {first[:40]!r}"
     detected = [Detected("coordinates", "geometry", evidence)]

@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 from itertools import chain, islice
 from typing import NamedTuple
 
-import numpy as np
-
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.surveys.coordinates import unit_factor, without_zone
+from app.formats.surveys.coordinates import share_inside
 from app.formats.surveys.declaration import FEET, FIXED_LAYOUTS, ImportDeclaration
 from app.formats.surveys.roles import names_coordinates
 from app.formats.surveys.table import (
@@ -28,9 +26,7 @@ from app.formats.surveys.table import (
     read_numbers,
 )
 from app.formats.text import SPACES, as_utf8, detect_delimiter, repeated_names, split_rows
-from app.geodesy import normalize_crs, reference_system
-from app.geodesy.systems import best_effort, covers
-from app.values import Floats
+from app.geodesy import reference_system
 
 # === Where the rows of delimited text begin, and what their columns are: by a header, or by position.
 
@@ -206,27 +202,12 @@ def _fits(rows: Sequence[Sequence[str]], names: tuple[str, ...], declaration: Im
     form = _form(rows, places, declaration)
     cells = [[row[place] if len(row) > place else "" for row in rows] for place in places]
     east, north = (read_numbers(column, "layout", form=form, required=True)[0] for column in cells)
-    return _inside(east, north, declaration) >= _MIN_SHARE
+    return share_inside(east, north, declaration) >= _MIN_SHARE
 
 
 def _form(rows: Sequence[Sequence[str]], places: tuple[int, int], declaration: ImportDeclaration) -> NumberForm:
     cells: Iterator[str] = (row[place] for row in rows for place in places if len(row) > place)
     return detect_number_form(cells, declaration.decimal)[0]
-
-
-def _inside(east: Floats, north: Floats, declaration: ImportDeclaration) -> float:
-    """Share of the positions that lie in the declared area, or the area of use of the CRS."""
-    name = normalize_crs(declaration.crs)
-    system = reference_system(name)
-    factor = unit_factor(declaration.unit, system)
-    east, _zone = without_zone(east * factor, system)
-    lon, lat = (np.asarray(v) for v in best_effort(name).transform(east, north * factor))
-    with np.errstate(invalid="ignore"):
-        inside = np.isfinite(lon) & np.isfinite(lat) & (np.abs(lat) <= 90) & covers(system.area_of_use, lon, lat)
-        if declaration.area_deg is not None:
-            west, south, east_deg, north_deg = declaration.area_deg
-            inside &= (lon >= west) & (lon <= east_deg) & (lat >= south) & (lat <= north_deg)
-    return float(inside.mean())
 
 
 def _no_header(why: str) -> UnreadableUpload:

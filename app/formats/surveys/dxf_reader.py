@@ -76,6 +76,8 @@ def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceT
         points.append((float(place[0]), float(place[1]), float(place[2])))
         if len(rows) > MAX_ROWS:
             raise _damaged("it has too many entities")
+    if layer is not None:
+        hidden = {name for name in hidden if name.lower() == layer.lower()}
     if hidden:
         message, cure = hidden_layers(hidden), "thaw or switch on layers whose points are wanted, and export again"
         if not rows:
@@ -168,12 +170,16 @@ def drawn_entities(
     off = {name for name, layer in layers if layer.is_off()}
     in_blocks = 0
 
-    def walk(entities: Iterable[Any], layer_of_block: str | None, level: int) -> Iterator[tuple[Any, str]]:
+    def count_in_blocks(level: int) -> None:
         nonlocal in_blocks
+        in_blocks += 1
+        if in_blocks > _MAX_IN_BLOCKS or level > _MAX_NESTED:
+            raise _damaged(f"its blocks hold over {_MAX_IN_BLOCKS} entities, or {_MAX_NESTED} levels of blocks")
+
+    def walk(entities: Iterable[Any], layer_of_block: str | None, level: int) -> Iterator[tuple[Any, str]]:
         for entity in entities:
-            in_blocks += level > 0
-            if in_blocks > _MAX_IN_BLOCKS or level > _MAX_NESTED:
-                raise _damaged(f"its blocks hold over {_MAX_IN_BLOCKS} entities, or {_MAX_NESTED} levels of blocks")
+            if level > 0:
+                count_in_blocks(level)
             kind, layer = entity.dxftype(), str(entity.dxf.layer)
             if kind not in kinds and kind != "INSERT":
                 continue
@@ -188,6 +194,7 @@ def drawn_entities(
                 yield entity, layer
             if kind == "INSERT" and entity.block() is not None and is_opened(entity, layer):
                 for reference in entity.multi_insert() if entity.mcount > 1 else (entity,):
+                    count_in_blocks(level)
                     yield from walk(reference.virtual_entities(), layer, level + 1)
 
     return walk(document.modelspace(), None, 0)
@@ -195,7 +202,7 @@ def drawn_entities(
 
 def hidden_layers(hidden: set[str]) -> str:
     """The warning about layers that are not drawn."""
-    names = sorted(hidden)
+    names = sorted({name.lower(): name for name in sorted(hidden, reverse=True)}.values())
     shown = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
     one = len(names) == 1
     return (

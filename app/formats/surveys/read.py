@@ -325,18 +325,11 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
     unit, height_unit, feet = _units(source, declaration, system, has_height=has_height)
     _check_datum(declaration, has_height=has_height)
     is_local = declaration.local_grid is not None
-    if is_local and not system.is_projected:
+    if is_local and (_is_wkt(crs) or not system.is_projected):
         raise InvalidParameter(
-            f"a local grid is transformed to eastings and northings, {crs} has none",
+            f"a local grid is transformed to a projected CRS with an EPSG code, {system.name[:60]} is none",
             field="crs",
-            limit="a projected CRS",
-            cure="declare the CRS of the control points",
-        )
-    if is_local and _is_wkt(crs):
-        raise InvalidParameter(
-            f"a local grid is transformed to a CRS with an EPSG code, {system.name[:60]!r} has none",
-            field="crs",
-            limit="an EPSG code",
+            limit="the EPSG code of a projected CRS",
             cure="declare the CRS of the control points",
         )
     first, zone = without_zone(read.first, system) if unit == "m" and not is_local else (read.first, None)
@@ -380,7 +373,7 @@ def _crs(
     if of_file is not None and _is_wkt(of_file):
         if declaration.crs is None:
             return of_file, system_of_wkt(of_file)[0]
-        of_file = None  # software writes systems of the registry in words of its own
+        of_file = None  # programs write registered systems as WKT that differs from the registry's
     in_file = normalize_crs(of_file) if of_file is not None else None
     if file_format == "geojson" and in_file is None:
         in_file = None if declaration.crs is not None else "OGC:CRS84"
@@ -437,7 +430,14 @@ def _units(
             cure="leave unit out, or export the file again in the unit that it is in",
         )
     unit = (declaration.unit or of_file or own) if system.is_projected else "deg"
-    height_unit = declaration.height_unit or of_file or declaration.unit
+    if None not in (source.height_unit, declaration.height_unit) and source.height_unit != declaration.height_unit:
+        raise InvalidParameter(
+            f"the heights of the file are in {source.height_unit}, the declaration has {declaration.height_unit}",
+            field="height_unit",
+            limit=str(source.height_unit),
+            cure="leave height_unit out, or export the file again in the unit that its heights are in",
+        )
+    height_unit = declaration.height_unit or source.height_unit or of_file or declaration.unit
     if height_unit is None and has_height and own in METRES and own != "m":
         raise InvalidParameter(
             "the unit of the heights is not declared",

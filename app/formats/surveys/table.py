@@ -192,6 +192,7 @@ class SourceTable:
     crs: str | None = None  # as the file declares it: ``EPSG:code``, or WKT where that has no code
     # unit of length of the coordinates, as the file declares it; ``ft`` where it does not state which foot
     unit: str | None = None
+    height_unit: str | None = None  # of the heights, where the file declares another one for them
     faults: Faults = field(default_factory=Faults)
     detected: tuple[Detected, ...] = ()
     has_names: bool = True  # whether the names are the file's own; those of a layout by position are not

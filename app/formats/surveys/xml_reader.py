@@ -113,7 +113,7 @@ def read_landxml(data: bytes) -> SourceTable:
     rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
-    crs = unit = None
+    crs = unit = height_unit = None
     for element in elements(data, "CgPoint", "CoordinateSystem", "Metric", "Imperial"):
         kind = local_name(element.tag)
         if kind == "CoordinateSystem":
@@ -121,6 +121,7 @@ def read_landxml(data: bytes) -> SourceTable:
             crs = f"EPSG:{code}" if code else crs
         elif kind != "CgPoint":
             unit = _linear_unit(element.get("linearUnit", ""))
+            height_unit = _elevation_unit(element.get("elevationUnit", ""), unit)
         else:
             found = _numbers((element.text or "").split())
             rows.append({"point": element.get("name"), "code": element.get("code"), "description": element.get("desc")})
@@ -128,7 +129,7 @@ def read_landxml(data: bytes) -> SourceTable:
                 faults.append(Fault(len(rows), "geometry", "no_point", "the CgPoint has no two or three numbers"))
                 found = [math.nan, math.nan]
             points.append((found[1], found[0], found[2] if len(found) == 3 else math.nan))
-    return _table("landxml", rows, points, faults, crs=crs, unit=unit)
+    return replace(_table("landxml", rows, points, faults, crs=crs, unit=unit), height_unit=height_unit)
 
 
 def _linear_unit(name: str) -> str:
@@ -141,6 +142,21 @@ def _linear_unit(name: str) -> str:
             cure="export the survey in metres or feet",
         )
     return unit
+
+
+def _elevation_unit(name: str, unit: str) -> str | None:
+    """Unit of the elevations, where it is another one than that of the coordinates; feet are of the same kind."""
+    found = _LANDXML_UNITS.get({"feet": "foot"}.get(name.lower(), name.lower()))
+    if name and found is None:
+        raise UnreadableUpload(
+            f"the unit of elevations {name[:40]!r} is not known",
+            field="file",
+            limit="meter, feet",
+            cure="export the survey with elevations in metres or feet",
+        )
+    if found is None or (found == "m") == (unit == "m"):
+        return None
+    return "m" if found == "m" else "ft-intl"
 
 
 def check_size(rows: int, names: int) -> None:

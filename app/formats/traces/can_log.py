@@ -70,7 +70,8 @@ class _FrameKind(NamedTuple):
         wanted = signal.arbitration_id or 0
         if self.arbitration_id == wanted:
             return True
-        if not (self.is_extended and signal.extended and wanted & 0xFF >= _ANY_SOURCE):
+        wants_extended = signal.extended or wanted > MAX_STANDARD
+        if not (self.is_extended and wants_extended and wanted & 0xFF >= _ANY_SOURCE):
             return False
         return _parameter_group(self.arbitration_id) == _parameter_group(wanted)
 

@@ -100,7 +100,9 @@ class CanSignal(Declaration):
     @model_validator(mode="after")
     def _is_placed(self) -> CanSignal:
         if self.name is None and self.arbitration_id is None:
-            raise InvalidParameter("a CAN signal has a name in a DBC, or an identifier and bits", limit="one of both")
+            raise InvalidParameter(
+                "a CAN signal has a name in a DBC, or an identifier and bits", limit="a name, an identifier, or both"
+            )
         if self.extended is False and (self.arbitration_id or 0) > MAX_STANDARD:
             raise InvalidParameter("an identifier above 0x7FF has 29 bits", field="extended", limit="true or left out")
         if self.factor == 0:

@@ -15,7 +15,7 @@ from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile
 from app.formats.surveys.declaration import METRES
 from app.geodesy import normalize_crs, place_positions, reference_system
-from app.geodesy.systems import is_global
+from app.geodesy.systems import geographic_code, is_global
 from app.values import Floats
 
 MAX_LOCAL_M = 200_000.0
@@ -245,12 +245,12 @@ def _to_geographic(name: str, first: Floats, second: Floats) -> tuple[Floats, Fl
     if is_global(system):
         return np.asarray(first), np.asarray(second), _CRS84, True
     datum = geodetic.datum.name if geodetic.datum is not None else ""
-    code = geodetic.to_epsg(min_confidence=_MIN_CONFIDENCE) or _DATUMS.get(datum.removesuffix(" ensemble"))
-    return np.asarray(first), np.asarray(second), f"EPSG:{code}" if code else _CRS84, code is not None
+    code = geographic_code(geodetic) or _DATUMS.get(datum.removesuffix(" ensemble"))
+    return np.asarray(first), np.asarray(second), code or _CRS84, code is not None
 
 
-_DATUMS = {"North American Datum 1983": 4269, "European Terrestrial Reference System 1989": 4258}
-"""EPSG codes of geographic systems whose datums PROJ strings name. Source: EPSG registry."""
+_DATUMS = {"North American Datum 1983": "EPSG:4269", "European Terrestrial Reference System 1989": "EPSG:4258"}
+"""Geographic systems whose datums PROJ strings name. Source: EPSG registry."""
 
 
 def _unit_m(system: CRS) -> float:

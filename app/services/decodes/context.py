@@ -47,14 +47,6 @@ class DecodeRules:
     idempotency_ttl: timedelta = timedelta(hours=24)
 
 
-# === Sentences about results.
-
-
-def count_of(number: int, what: str) -> str:
-    """A number with its noun, in the plural where it has to be."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
 # === The times of a decode: UTC where the upload states when it was taken, else those of its recording.
 
 

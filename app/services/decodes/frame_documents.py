@@ -20,9 +20,9 @@ from app.families import get_family, union_of_documents
 from app.families.family import FrameReading
 from app.families.plate.plates import PLATE
 from app.formats.images import ImageHeader
+from app.formats.text import count_of
 from app.geodesy import LocalizationGrade
 from app.markers.reading import PlateOutcome
-from app.services.decodes.context import count_of
 from app.services.decodes.frame_poses import FramePose, GapDocument, ReceiverPositions
 from app.services.decodes.matching import FRAME_READERS
 from app.services.documents import ErrorDocument, document_of, error_document, rounded

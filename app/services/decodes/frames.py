@@ -80,7 +80,7 @@ class FrameHandler(UploadHandler[FrameSignal]):
         """Never: a frame takes some milliseconds. What is no picture is of no kind that any handler decodes."""
         head = file.head(_SIGNATURE_BYTES)
         if head and not is_picture(head):
-            raise unknown_picture(head, list_decoded(), _DECLARE)
+            raise unknown_picture(head, list_decoded(), _DECLARE, of_drive=True)
         return False
 
     def start(self, upload: Upload) -> Pending[FrameSignal]:
@@ -167,9 +167,11 @@ def read_frame(
         fix = None
         if match is not None and camera is not None:
             heading_deg, label = context.heading_deg, get_family(reading.family).label
-            reading, doubt = FRAME_READERS[reading.family].orient(reading, match, camera, heading_deg)
+            reading, pose_warning = FRAME_READERS[reading.family].orient(reading, match, camera, heading_deg)
             if reading.pose is not None:
-                fix = fix_from_match(reading.pose, camera, match, label, heading_deg, epoch=epoch, doubt=doubt)
+                fix = fix_from_match(
+                    reading.pose, camera, match, label, heading_deg, epoch=epoch, pose_warning=pose_warning
+                )
         markers.append(ReadMarker(reading, match, fix))
     frame = ReadFrame(
         index=member.index,

@@ -14,13 +14,13 @@ from app.decoders.cerpm.merge import Disagreement, vehicle_positions
 from app.decoders.cerpm.signal import SignalProfile
 from app.decoders.cerpm.verify import Verdict, VerifiedPacket
 from app.decoding.recordings import DriveFiles, ReadPackets
+from app.formats.text import count_of
 from app.geodesy import LocalizationGrade
 from app.lanes.overlay import LaneInFrame
 from app.lanes.types import Lane
 from app.markers.cerpm import LaneSide
 from app.radio.link import PathLoss
 from app.registry.decodes import NewObservation
-from app.services.decodes.context import count_of
 from app.services.decodes.frame_poses import ReceiverPositions, receiver_positions
 from app.services.decodes.lane_documents import (
     DecodedLaneDocument,

@@ -10,9 +10,9 @@ from typing_extensions import TypedDict
 from app import __version__
 from app.decoders.magnet.identify import ReadTag, ReadTrace, TagFix, TagMatch
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding
+from app.formats.text import count_of
 from app.formats.traces.declaration import TraceReport
 from app.markers.magnet_design import Meaning
-from app.services.decodes.context import count_of
 from app.services.decodes.trace_tasks import DecodedTrace, TraceMotion
 from app.services.documents import document_of, rounded
 

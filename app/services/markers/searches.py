@@ -124,13 +124,7 @@ def area_of(polygons: Sequence[Sequence[Ring]], field: str = "polygon") -> Area:
         for polygon in polygons
     ]
     shape = shapes[0] if len(shapes) == 1 else shapely.MultiPolygon(shapes)
-    if not shape.is_valid:
-        raise InvalidParameter(
-            f"the polygon is not simple: {shapely.is_valid_reason(shape)}",
-            field=field,
-            limit="rings that neither cross nor touch along a line, holes inside",
-            cure="correct the place that is named, or let a GIS make the geometry valid",
-        )
+    _check_valid(shape, field)
     return Area(shapely.to_wkb(shape, byte_order=1), tuple(Box(*part.bounds) for part in shapes))
 
 
@@ -159,15 +153,26 @@ def area_of_shape(shape: shapely.Geometry, field: str, within_m: float = 0.0) ->
     for lon_deg, lat_deg in points.tolist():
         check_lon_lat(lon_deg, lat_deg, field)
     if within_m:
+        _check_valid(shape, field)
         shape = _buffered(shape, within_m, field)
     if shape.geom_type in ("Polygon", "MultiPolygon"):
         document = json.loads(shapely.to_geojson(shape))
         return area_of([document["coordinates"]] if shape.geom_type == "Polygon" else document["coordinates"], field)
     if np.ptp(points[:, 0]) > _HALF_TURN_DEG:
         raise _over_antimeridian(field)
-    parts = shapely.get_parts(shape)[:MAX_POLYGONS]
-    boxes = [part.bounds for part in parts] if len(parts) == shapely.get_num_geometries(shape) else [shape.bounds]
+    parts = [part for part in shapely.get_parts(shape) if not part.is_empty]
+    boxes = [part.bounds for part in parts] if len(parts) <= MAX_POLYGONS else [shape.bounds]
     return Area(shapely.to_wkb(shape, byte_order=1), tuple(Box(*bounds) for bounds in boxes))
+
+
+def _check_valid(shape: shapely.Geometry, field: str) -> None:
+    if not shape.is_valid:
+        raise InvalidParameter(
+            f"the polygon is not simple: {shapely.is_valid_reason(shape)}",
+            field=field,
+            limit="rings that neither cross nor touch along a line, holes inside",
+            cure="correct the place that is named, or let a GIS make the geometry valid",
+        )
 
 
 def _buffered(shape: shapely.Geometry, within_m: float, field: str) -> shapely.Geometry:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import fields
 from datetime import timedelta
 
@@ -113,8 +112,10 @@ class Alignments:
         with self._database.read() as connection:
             ALIGNMENTS.check_name(connection, agency_id, name)
         read = self._processes.run(summarize_road, road, wait_s=BUSY_WAIT_S)
+        warnings = read.summary["warnings"]
         with self._database.read() as connection:
-            exchanged = list(_find_exchanged(connection, agency_id, read.summary))
+            if exchanged := _exchanged_warning(connection, agency_id, read.summary):
+                warnings = [exchanged, *warnings]
         with staged(self._blobs) as stage:
             source_key = stage.add("alignments", road.file)
             with (
@@ -134,7 +135,10 @@ class Alignments:
                         "file_name": road.file_name,
                         **source,
                     },
-                    "summary": {**read.summary, "warnings": [*exchanged, *read.summary["warnings"]]},
+                    "summary": {
+                        **read.summary,
+                        "warnings": warnings,
+                    },
                 }
                 document = answer.store(alignment_document(ALIGNMENTS.add(connection, agency_id, values)))
                 add_lanes(connection, agency_id, document["id"], read.lanes)
@@ -219,19 +223,20 @@ def alignment_document(row: AlignmentRow) -> AlignmentDocument:
     )
 
 
-def _find_exchanged(connection: sa.Connection, agency_id: str, summary: RoadSummary) -> Iterator[str]:
-    """A warning if registered markers show that longitude and latitude are exchanged, as for surveys."""
+def _exchanged_warning(connection: sa.Connection, agency_id: str, summary: RoadSummary) -> str | None:
+    """The warning if registered markers show that longitude and latitude are exchanged, as for surveys."""
     west, south, east, north = summary["extent_deg"]
     lon_deg, lat_deg = (west + east) / 2, (south + north) / 2
     if summary["crs"] not in _LON_LAT or west > east or abs(lon_deg) > 90.0:
-        return
+        return None
     if is_any_near(connection, agency_id, lon_deg, lat_deg, KNOWN_M):
-        return
-    if is_any_near(connection, agency_id, lat_deg, lon_deg, KNOWN_M):
-        yield (
-            f"No marker is registered within {KNOWN_M / 1000:g} km of the road, but some are near it if longitude and "
-            "latitude are exchanged. Check the order of the coordinates: GeoJSON has the longitude first."
-        )
+        return None
+    if not is_any_near(connection, agency_id, lat_deg, lon_deg, KNOWN_M):
+        return None
+    return (
+        f"No marker is registered within {KNOWN_M / 1000:g} km of the road, but some are near it if longitude and "
+        "latitude are exchanged. Check the order of the coordinates: GeoJSON has the longitude first."
+    )
 
 
 def _registered_road(row: RoadRow, lanes: RoadLanes) -> RegisteredRoad:

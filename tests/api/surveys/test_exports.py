@@ -192,20 +192,14 @@ def test_files_of_several_pages_hold_every_value(
         assert shapely.get_z(points[:3]).tolist() == [160.25, 161.25, 162.25]
 
 
-def test_geoparquet_is_as_its_standard_has_it(
-    server: LiveServer, client: httpx.Client, markers: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_geoparquet_is_as_its_standard_has_it(client: httpx.Client, markers: list[dict[str, float]]) -> None:
     """GeoParquet 1.1.0: required members, geometry as ISO WKB, and a column of boxes that the metadata name."""
-    monkeypatch.setattr(exports, "_PAGE", 2)
-    monkeypatch.setattr(formats, "_GIS_PAGE", 2)
-    monkeypatch.setattr(server.app.state.use_cases.exports, "_write", formats.write_file)
     low = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": -1e-9}, "road": "Straße =1"}
     assert client.post("/v1/markers", json=low).status_code == 201
     answer = client.get("/v1/exports/geoparquet")
     assert answer.headers["content-type"] == "application/vnd.apache.parquet"
     assert "markers.parquet" in answer.headers["content-disposition"]
     file = parquet.ParquetFile(io.BytesIO(answer.content))
-    assert file.metadata.num_row_groups == 2
     assert file.metadata.row_group(0).column(0).compression == "ZSTD"
     table = file.read()
     assert table.column_names == [*FIELDS, "bbox", "geometry"]
@@ -230,6 +224,26 @@ def test_geoparquet_is_as_its_standard_has_it(
     assert about["covering"] == {"bbox": {name: ["bbox", name] for name in ("xmin", "ymin", "xmax", "ymax")}}
     assert about["bbox"] == [-77.15, -1e-9, 160.25, markers[2]["lon_deg"], LAT, 162.25]
     assert "epoch" not in about
+
+
+def test_geoparquet_has_a_row_group_for_each_page(
+    client: httpx.Client, markers: list[dict[str, float]], tmp_path: Path
+) -> None:
+    """Its metadata are those of all pages together."""
+    features = client.get("/v1/exports/geojson").json()["features"]
+    records = []
+    for feature in features:
+        place = dict(zip(("lon_deg", "lat_deg"), feature["geometry"]["coordinates"], strict=False))
+        record = {"id": feature["id"], **feature["properties"], **place}
+        records.append({name: record[name] for name in FIELDS})
+    written = []
+    for name, pages in (("one", [records]), ("two", [records[:2], records[2:]])):
+        path = tmp_path / f"{name}.parquet"
+        assert formats.write_geoparquet(pages, path).left_out == ()
+        written.append(parquet.ParquetFile(path))
+    assert [file.metadata.num_row_groups for file in written] == [1, 2]
+    assert written[0].read().equals(written[1].read())
+    assert written[0].metadata.metadata[b"geo"] == written[1].metadata.metadata[b"geo"]
 
 
 def test_geoparquet_needs_its_library(

@@ -164,7 +164,7 @@ def test_units_and_what_is_left_out() -> None:
     curvature = file.lanes[0].curvature_per_m
     assert curvature is not None
     assert curvature.max() == pytest.approx(1 / 30.48)
-    assert "1 splines are left out, the first on layer S" in file.warnings[1]
+    assert "left out: splines (1 in all), the first on layer S" in file.warnings[1]
     document, space = _drawing(0)
     space.add_line((0, 0), (90, 0))
     unstated = _read(document)
@@ -188,7 +188,7 @@ def test_layers_that_are_not_drawn_are_left_out() -> None:
     file = _read(document)
     assert [lane.name for lane in file.lanes] == ["LANE", "viewport", "locked"]
     (warning,) = file.warnings
-    assert warning.startswith("The layers OFF, OLD, off are frozen or switched off")
+    assert warning.startswith("The layers OFF, OLD are frozen or switched off")
 
 
 def test_a_drawing_whose_lines_are_all_hidden_is_refused_with_the_cure() -> None:
@@ -276,6 +276,19 @@ def test_symbols_are_no_lanes_but_events_and_areas() -> None:
     assert [warning for warning in file.warnings if "symbols" in warning] == list(file.warnings)
 
 
+def test_symbols_are_small_however_deep_blocks_are_nested() -> None:
+    """Each level holds the one below a thousand times: measuring it as a symbol would not end."""
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "road"})
+    document.blocks.new("L0").add_line((0, 0), (0.001, 0))
+    for level in range(1, 5):
+        block = document.blocks.new(f"L{level}")
+        block.add_blockref(f"L{level - 1}", (0, 0), dxfattribs={"row_count": 1000, "row_spacing": 1e-6})
+    space.add_blockref("L4", (10, 0), dxfattribs={"layer": "plan"})
+    with pytest.raises(UnreadableUpload, match="its blocks hold over"):
+        _read(document)
+
+
 def test_blocks_on_hidden_layers_are_left_out() -> None:
     document, space = _drawing()
     document.layers.add("frozen").freeze()
@@ -299,8 +312,8 @@ def test_blocks_that_cannot_be_read_are_reported() -> None:
     block.add_lwpolyline([(0, 30, 0), (100, 30, BULGE_90), (120, 50, 0)], format="xyb", dxfattribs={"layer": "A"})
     space.add_blockref("B", (0, 0), dxfattribs={"xscale": 2})  # arcs become ellipses
     warnings = " ".join(_read(document).warnings)
-    assert "1 references to other drawings are left out, the first is other; bind" in warnings
-    assert "1 ellipses are left out, the first on layer A" in warnings
+    assert "1 reference to other drawings left out, the first is other; bind" in warnings
+    assert "left out: ellipses (1 in all), the first on layer A" in warnings
     loop = document.blocks.new("LOOP")
     loop.add_line((0, 0), (90, 0))
     loop.add_blockref("LOOP", (9, 9))
@@ -347,7 +360,7 @@ def test_multilines_are_reported() -> None:
     space.add_line((0, 0), (90, 0))
     space.add_mline([(0, 9), (90, 9)], dxfattribs={"layer": "M"})
     space.add_ellipse((0, 50), (40, 0), 0.5, dxfattribs={"layer": "E"})
-    assert _read(document).warnings[0].startswith("2 multilines and ellipses are left out, the first on layer M")
+    assert _read(document).warnings[0].startswith("left out: multilines and ellipses (2 in all), the first on layer M")
 
 
 @pytest.mark.parametrize(

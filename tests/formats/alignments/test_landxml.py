@@ -13,6 +13,8 @@ from app.formats.alignments.curves import clothoid
 from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile, StationEquation
 from app.formats.alignments.landxml import read_landxml
 from app.formats.alignments.read import read_alignment
+from app.formats.surveys.declaration import METRES, ImportDeclaration
+from app.formats.surveys.read import read_survey
 from app.values import Floats
 from tests.formats.alignments.mutations import damaged
 
@@ -171,12 +173,44 @@ def test_circles_of_profiles() -> None:
 
 
 def test_heights_end_with_the_profile() -> None:
-    z = centre(read_landxml(landxml(FLAT, extra=profile("<PVI>20 1</PVI><PVI>120 2</PVI>"))))[:, 2]
+    file = read_landxml(landxml(FLAT, extra=profile("<PVI>20 1</PVI><PVI>120 2</PVI>")))
+    assert "the profile begins 20.0 m after the line's start and ends 80.0 m before its end" in file.warnings[0]
+    z = centre(file)[:, 2]
     assert np.isnan(z[[0, -1]]).all()
     assert np.isfinite(z).sum() == pytest.approx(51, abs=2)
     feet = '<Units><Imperial linearUnit="foot"/></Units>'
     flat = landxml(FLAT, extra=profile("<PVI>0 100</PVI><PVI>200 100</PVI>"), units=feet)
     assert centre(read_landxml(flat))[:, 2] == pytest.approx(100.0), "heights are in the unit of the file"
+
+
+@pytest.mark.parametrize(
+    ("units", "height"),
+    [
+        ('<Metric linearUnit="meter" elevationUnit="feet"/>', 30.48),
+        ('<Metric linearUnit="meter" elevationUnit="meter"/>', 100.0),
+        ('<Imperial linearUnit="USSurveyFoot" elevationUnit="feet"/>', 100.0),
+        ('<Imperial linearUnit="foot" elevationUnit="meter"/>', 100.0 / 0.3048),
+    ],
+)
+def test_heights_have_their_own_unit(units: str, height: float) -> None:
+    flat = landxml(FLAT, extra=profile("<PVI>0 100</PVI><PVI>200 100</PVI>"), units=f"<Units>{units}</Units>")
+    file = read_landxml(flat)
+    assert centre(file)[:, 2] == pytest.approx(height, rel=1e-9), "in the unit of the lengths"
+    points = flat.replace(b"</LandXML>", b'<CgPoints><CgPoint name="1">5e5 4e5 100</CgPoint></CgPoints></LandXML>')
+    declared = ImportDeclaration(crs="EPSG:26915", vertical_datum="ellipsoid", format="landxml")
+    survey = read_survey(points, declared)
+    assert survey.height is not None
+    height_m = survey.height[0] * METRES[survey.height_unit]
+    assert height_m == pytest.approx(height * file.unit_m, rel=3e-6)
+
+
+def test_points_of_one_name_at_several_places_are_no_reference() -> None:
+    shape = '<Line><Start pntRef="A"/><End>0 30</End></Line>'
+    points = '<CgPoints><CgPoint name="A">0 0</CgPoint></CgPoints><CgPoints><CgPoint name="A">5 {}</CgPoint></CgPoints>'
+    with pytest.raises(UnreadableUpload, match="points of this name are at 2 places"):
+        read_landxml(landxml(shape, head=points.format(1)))
+    assert read_landxml(landxml(shape, head=points.replace("5 {}", "0  0"))).lanes
+    assert read_landxml(landxml(FLAT, head=points.format(1))).lanes
 
 
 def test_station_equations() -> None:
@@ -202,27 +236,30 @@ def test_station_equations() -> None:
 # --- feet -------------------------------------------------------------------------------------------------------------
 
 
+UNDECLARED = AlignmentDeclaration()
+
+
 @pytest.mark.parametrize(
     ("unit", "epsg", "declared", "metres", "note"),
     [
-        ("foot", 6539, {}, US_FOOT_M, "read as ft-us, the unit of NAD83(2011) / New York Long Island (ftUS)"),
-        ("Foot", 2222, {}, 0.3048, "read as ft-intl, the unit of NAD83 / Arizona East (ft)"),
-        ("foot", 25832, {}, 0.3048, "read as ft-intl, because the CRS is not in feet"),
-        ("foot", None, {}, 0.3048, "read as ft-intl, because the CRS is not in feet"),
-        ("foot", None, {"crs": "EPSG:6539"}, US_FOOT_M, "read as ft-us"),
-        ("foot", 25832, {"unit": "ft-us"}, US_FOOT_M, ""),
-        ("foot", 6539, {"unit": "ft-intl"}, 0.3048, ""),
-        ("inch", 6539, {}, US_FOOT_M / 12, "read as ft-us"),
-        ("mile", 25832, {}, 1609.344, "read as ft-intl"),
-        ("USSurveyFoot", 2222, {}, US_FOOT_M, ""),
+        ("foot", 6539, UNDECLARED, US_FOOT_M, "read as ft-us, the unit of NAD83(2011) / New York Long Island (ftUS)"),
+        ("Foot", 2222, UNDECLARED, 0.3048, "read as ft-intl, the unit of NAD83 / Arizona East (ft)"),
+        ("foot", 25832, UNDECLARED, 0.3048, "read as ft-intl, because the CRS is not in feet"),
+        ("foot", None, UNDECLARED, 0.3048, "read as ft-intl, because the CRS is not in feet"),
+        ("foot", None, AlignmentDeclaration(crs="EPSG:6539"), US_FOOT_M, "read as ft-us"),
+        ("foot", 25832, AlignmentDeclaration(unit="ft-us"), US_FOOT_M, ""),
+        ("foot", 6539, AlignmentDeclaration(unit="ft-intl"), 0.3048, ""),
+        ("inch", 6539, UNDECLARED, US_FOOT_M / 12, "read as ft-us"),
+        ("mile", 25832, UNDECLARED, 1609.344, "read as ft-intl"),
+        ("USSurveyFoot", 2222, UNDECLARED, US_FOOT_M, ""),
     ],
 )
 def test_feet_are_those_of_the_crs_or_declared(
-    unit: str, epsg: int | None, declared: dict[str, str], metres: float, note: str
+    unit: str, epsg: int | None, declared: AlignmentDeclaration, metres: float, note: str
 ) -> None:
     head = f'<CoordinateSystem epsgCode="{epsg}"/>' if epsg else ""
     data = landxml(FLAT, units=f'<Units><Imperial linearUnit="{unit}"/></Units>', head=head, sta=1e6)
-    file = read_alignment(data, declaration=AlignmentDeclaration(**declared))  # type: ignore[arg-type]
+    file = read_alignment(data, declaration=declared)
     assert file.unit_m == pytest.approx(metres, rel=1e-12)
     assert file.start_station_m == pytest.approx(1e6 * metres, rel=1e-12)
     assert [note in warning for warning in file.warnings] == [True] * bool(note)
@@ -371,6 +408,8 @@ GOOD_SPIRAL = f'<Spiral rot="cw" length="100" radiusStart="INF" radiusEnd="100">
             landxml(f'<Curve rot="cw">{ends((0, 0), (10, 0))}<Center>3 3</Center></Curve>'),
             "the distances of Start and End from Center differ by",
         ),
+        (landxml(f'<Curve rot="cw" radius="0">{ends((0, 0), (0.01, 0))}</Curve>'), "no arc of radius 0 joins"),
+        (landxml(FLAT, units='<Units><Metric linearUnit="meter" elevationUnit="rod"/></Units>'), "elevations 'rod' is"),
         (landxml(GOOD_SPIRAL), "the element misses its End by"),
         (landxml(GOOD_SPIRAL.replace('rot="cw"', 'rot="cw" spiType="bloss"')), "the spiral is 'bloss'"),
         (landxml(GOOD_SPIRAL.replace('"INF"', '"0"')), "radiusStart is 0"),

@@ -448,14 +448,14 @@ def test_geometries_without_length_are_left_out() -> None:
     )
     file = read_alignment(document(road(plan, lanes=section(left=""))))
     assert np.ptp(centre(file.lanes[0])[:, 0]) == 100.0
-    assert file.warnings == ("road 7: 3 geometries of zero length are left out.",)
+    assert file.warnings == ("road 7: geometries of zero length, which are left out: 3.",)
 
 
 # --- directions and revisions of 1.8 ----------------------------------------------------------------------------------
 
 
-def _revised(major: str, minor: str, **parts: str) -> AlignmentFile:
-    text = document(road(**parts)).decode()  # type: ignore[arg-type]
+def _revised(major: str, minor: str, one_road: str) -> AlignmentFile:
+    text = document(one_road).decode()
     return read_alignment(text.replace('revMajor="1" revMinor="7"', f'revMajor="{major}" revMinor="{minor}"').encode())
 
 
@@ -471,8 +471,10 @@ def test_reversed_lanes_run_against_their_side(rule: str, number: int) -> None:
     both = LANE.format(side, '<roadMark sOffset="0" type="broken"/>')
     both += _directed(number, 'direction="reversed"', marks)
     found = lanes(
-        _revised("1", "8", lanes=section(left=both, right="") if number > 0 else section(left="", right=both),
-                 attributes=f'id="7" junction="-1" rule="{rule}"')
+        _revised("1", "8", road(
+            lanes=section(left=both, right="") if number > 0 else section(left="", right=both),
+            attributes=f'id="7" junction="-1" rule="{rule}"',
+        ))
     )  # fmt: skip
     usual, against = (found[f"road 7 lane {n}"] for n in (side, number))
     eastward = (number < 0) == (rule == "RHT")
@@ -487,7 +489,7 @@ def test_reversed_lanes_run_against_their_side(rule: str, number: int) -> None:
 def test_a_lane_that_changes_its_direction_is_two_lanes() -> None:
     ahead = _directed(-1, 'direction="standard"', '<link><successor id="-1"/></link>')
     back = _directed(-1, 'direction="reversed"', '<link><predecessor id="-1"/></link>')
-    found = lanes(_revised("1", "8", lanes=section(left="", right=ahead) + section(60, left="", right=back)))
+    found = lanes(_revised("1", "8", road(lanes=section(left="", right=ahead) + section(60, left="", right=back))))
     first, second = found.values()
     assert centre(first)[[0, -1], 0].tolist() == [0.0, 60.0]
     assert centre(second)[[0, -1], 0].tolist() == [100.0, 60.0]
@@ -503,7 +505,7 @@ def test_a_lane_that_changes_its_direction_is_two_lanes() -> None:
     ],
 )
 def test_other_directions_are_reported(direction: str, warning: str) -> None:
-    file = _revised("1", "8", lanes=section(left="", right=_directed(-1, direction)))
+    file = _revised("1", "8", road(lanes=section(left="", right=_directed(-1, direction))))
     assert centre(file.lanes[0])[0, 0] == 0.0
     assert [one for one in file.warnings if "road 7, lane -1 at s 0" in one and warning in one] == list(file.warnings)
     assert len(file.warnings) == bool(warning)
@@ -514,5 +516,5 @@ def test_other_directions_are_reported(direction: str, warning: str) -> None:
     [("1", "4", False), ("1", "8", False), ("1", "9", True), ("2", "0", True), ("1", "x", False), ("", "", False)],
 )
 def test_newer_revisions_are_reported(major: str, minor: str, newer: bool) -> None:
-    file = _revised(major, minor)
+    file = _revised(major, minor, road())
     assert [f"revision {major}.{minor} of OpenDRIVE" in warning for warning in file.warnings] == [True] * newer

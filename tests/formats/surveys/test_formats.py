@@ -271,9 +271,7 @@ def test_points_that_are_not_drawn_are_left_out() -> None:
     read = _read(text.getvalue())
     assert read.first.tolist() == [456789.0]
     assert read.faults.counts == {"hidden_layers": 1}
-    with pytest.raises(
-        UnreadableUpload, match=r"no points that are drawn\. The layers OFF, old are frozen or switched off"
-    ):
+    with pytest.raises(UnreadableUpload, match=r"no points that are drawn\. The layer old is frozen or switched off"):
         _read(text.getvalue(), layer="OLD")
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import shapely
 
 from app.errors import InvalidParameter
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import SurveyTable
+from app.geodesy.systems import system_of_wkt
 
 NUMBERS = CodeForm("[1-9][0-9]{0,9}", True, "numbers of CERPMs")
 DEGREES = {"crs": "EPSG:4326", "family": "cerpm"}
@@ -100,3 +102,75 @@ def test_of_two_heights_the_one_above_the_declared_datum_is_read() -> None:
         height = _read(text, vertical_datum=datum).height
         assert height is not None
         assert height[0] == expected
+
+
+# The X of these systems is the northing; their false origins make both orders lie in their areas of use.
+@pytest.mark.parametrize("crs", ["EPSG:2180", "EPSG:6677"])
+def test_columns_x_and_y_that_can_be_read_in_both_orders_are_refused(crs: str) -> None:
+    north = {"EPSG:2180": (480_000.0, 640_000.0), "EPSG:6677": (-30_000.0, -8_000.0)}[crs]
+    rows = "\n".join(["X;Y", *(f"{north[0] + k};{north[1] + k}" for k in range(5))])
+    with pytest.raises(InvalidParameter, match="in both orders") as caught:
+        _read(rows, crs=crs)
+    assert caught.value.cure is not None
+    assert 'declare columns {"easting": "Y", "northing": "X"}' in caught.value.cure
+    read = _read(rows, crs=crs, columns={"easting": "Y", "northing": "X"})
+    assert (read.first[0], read.second[0]) == north[::-1]
+    assert _read(rows.replace("X;Y", "E;N"), crs=crs).first[0] == north[0]
+
+
+def test_columns_x_and_y_of_which_one_order_lies_in_the_area_are_read() -> None:
+    rows = "X;Y\n3400000;5600000\n3400010;5600010"  # EPSG:31467 has X to the north, and the file GIS order
+    assert _read(rows, crs="EPSG:31467").first[0] == 3_400_000
+    in_poland = "X;Y\n480000;640000\n480010;640010"
+    assert _read(in_poland, crs="EPSG:2180", area_deg=(18.0, 53.0, 20.0, 54.9)).first[0] == 480_000
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "refused"),
+    [
+        ("EPSG", ["25832", "25833"], True),
+        ("datum", ["NAD83", "NAD27"], True),
+        ("Datum", ["12.05.2024", "13.05.2024"], False),  # German for a date
+        ("Zone", ["32U", "33U"], True),
+        ("zone", ["north", "south"], False),
+        ("epsg", ["25832", "25832"], False),
+    ],
+)
+def test_rows_in_several_systems_are_refused(name: str, cells: list[str], refused: bool) -> None:
+    rows = _rows(name, *cells)
+    if not refused:
+        assert _read(rows).rows == 2
+        return
+    with pytest.raises(InvalidParameter, match="the rows are in several systems"):
+        _read(rows)
+    assert _read(rows, columns={"description": name}).rows == 2
+
+
+def test_geometries_with_several_srids_are_refused() -> None:
+    rows = "id,geom\n1,SRID=25832;POINT(440000 5430000)\n2,SRID=25833;POINT(440010 5430000)"
+    with pytest.raises(InvalidParameter, match="several SRIDs: 25832, 25833"):
+        read_survey(rows.encode(), ImportDeclaration(), None)
+    points = [shapely.set_srid(shapely.Point(440_000, 5_430_000), srid) for srid in (25832, 25833)]
+    hexes = [shapely.to_wkb(point, hex=True, include_srid=True) for point in points]
+    hex_rows = f"id,geom\n1,{hexes[0]}\n2,{hexes[1]}"
+    with pytest.raises(InvalidParameter, match="several SRIDs: 25832, 25833"):
+        read_survey(hex_rows.encode(), ImportDeclaration(), None)
+    assert read_survey(rows.replace("25833", "25832").encode(), ImportDeclaration(), None).crs == "EPSG:25832"
+
+
+@pytest.mark.parametrize(
+    ("datum", "spheroid", "code"),
+    [
+        ("D_WGS_1984", '"WGS_1984",6378137.0,298.257223563', "EPSG:4326"),
+        ("D_ETRS_1989", '"GRS_1980",6378137.0,298.257222101', "EPSG:4258"),
+        ("D_North_American_1983", '"GRS_1980",6378137.0,298.257222101', "EPSG:4269"),
+    ],
+)
+def test_a_county_grid_has_the_geographic_system_of_its_datum(datum: str, spheroid: str, code: str) -> None:
+    wkt = (
+        f'PROJCS["County",GEOGCS["GCS",DATUM["{datum}",SPHEROID[{spheroid}]],PRIMEM["Greenwich",0.0],'
+        'UNIT["Degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],PARAMETER["False_Easting",170000.0],'
+        'PARAMETER["False_Northing",50000.0],PARAMETER["Central_Meridian",-90.5],PARAMETER["Scale_Factor",1.0000339],'
+        'PARAMETER["Latitude_Of_Origin",45.0],UNIT["Meter",1.0]]'
+    )
+    assert system_of_wkt(wkt)[1] == code

@@ -119,7 +119,7 @@ def parse_road(element: ET.Element) -> Road:
     warnings += curve.warnings
     start = float(curve.s[0])
     if abs(start) > GAP_WARNING_M:
-        warnings.append(f"{place}: the planView begins at s {start:.3f} m; the road has no lanes before it.")
+        warnings.append(f"{place}: the planView begins at s {start:.3f} m; lanes begin at s {max(start, 0.0):.3f} m.")
     stated = attribute(element, "length", place, curve.end_s)
     if abs(stated - curve.end_s) > GAP_WARNING_M:
         warnings.append(f"{place}: the geometries end at s {curve.end_s:.3f} m, not at the length {stated:.3f} m.")
@@ -161,8 +161,7 @@ def _pieces(road: ET.Element, place: str, warnings: list[str]) -> list[Piece]:
             f"{place}: the planView {state}", field="file", limit="one or more", cure="export the file again"
         )
     if len(pieces) < len(geometries):
-        count = len(geometries) - len(pieces)
-        warnings.append(f"{place}: {count} geometries of zero length are left out.")
+        warnings.append(f"{place}: geometries of zero length, which are left out: {len(geometries) - len(pieces)}.")
     return pieces
 
 
@@ -538,9 +537,9 @@ def _chains(sections: tuple[Section, ...]) -> list[list[tuple[int, int]]]:
             backwards = (other.id for other in after.lanes.values() if other.predecessor == lane.id)
             next_id = lane.successor if lane.successor is not None else next(backwards, None)
             found = after.lanes.get(next_id) if next_id is not None else None
-            usable = lane.drivable and found is not None and found.drivable and found.id * lane.id > 0
-            usable = usable and found is not None and found.reversed == lane.reversed
-            if found is not None and usable and (i + 1, found.id) not in following.values():
+            if found is None or (i + 1, found.id) in following.values():
+                continue
+            if lane.drivable and found.drivable and found.id * lane.id > 0 and found.reversed == lane.reversed:
                 following[i, lane.id] = (i + 1, found.id)
     taken = set(following.values())
     chains = []
