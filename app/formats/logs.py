@@ -57,6 +57,11 @@ class LogReport:
         if text not in self.warnings and len(self.warnings) < MAX_LISTED:
             self.warnings.append(text)
 
+    def note_zone(self, value: object, clock: LogClock) -> None:
+        """Warn if a text with a time names no zone, and none is declared."""
+        if isinstance(value, str) and ":" in value and not clock.utc_offset_s and not has_zone(value):
+            self.warn("times without a zone were taken as UTC; declare the zone's offset if they are local")
+
     def note_unread_time(self, value: object, time_s: float) -> bool:
         """Keep the first value that should be a time and cannot be read, `time_s` being NaN; True if it is this one."""
         text = "" if value is None else clean_text(str(value), 40)

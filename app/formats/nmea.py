@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, time, timedelta
 from functools import reduce
@@ -26,6 +26,7 @@ _READ = (*_POSITIONS, *_UNTIMED, "GST", "ZDA", "DTM")
 _MIN_SPEED_KN = 2.0
 """Below this speed the course over ground is noise, not the heading. [kn]"""
 _HALF_DAY_S = 43_200.0
+_SAME_DEG = 2e-4  # [deg] above the rounding to hundredths of a minute of a receiver's different sentences
 _TURNED_DEG = 5.0  # [deg] a heading that changes more from one sentence to the next depends on its epoch
 _CLOCK_TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.\d*)?\Z", re.ASCII)
 _TIME_FIELDS = {"GLL": 5}  # field of a sentence that holds its time, where it is not the first
@@ -139,16 +140,13 @@ def read_nmea(text: str, clock: LogClock, day: date | None, report: LogReport) -
     import pynmeagps  # here: only a decoder process reads files
 
     reading = _Reading(report)
-    sentences = list(_find_sentences(text, report))
-    chosen = _choose_talkers(sentences)
+    sentences = list(_of_one_solution(list(_find_sentences(text, report)), report))
     rmc_times_s = {
         _second_of_day(kind, sentence)
-        for _entry, talker, kind, sentence in sentences
-        if kind == "RMC" and chosen["RMC"] == talker and _field(sentence, 2) == "A"
+        for _entry, kind, sentence in sentences
+        if kind == "RMC" and _field(sentence, 2) == "A"
     }
-    for entry, talker, kind, sentence in sentences:
-        if chosen.get(kind, talker) != talker:
-            continue
+    for entry, kind, sentence in sentences:
         if _is_estimated(kind, sentence):
             report.warn("positions were estimated by dead reckoning in places")
         second_s = _second_of_day(kind, sentence)
@@ -217,13 +215,44 @@ def _checksum(content: str) -> int:
     return reduce(xor, content.encode("ascii", "replace"), 0)
 
 
-def _choose_talkers(sentences: Iterable[tuple[int, str, str, str]]) -> dict[str, str]:
-    """Talker of each kind of sentence: the combined solution (GN), or else the most frequent."""
+def _of_one_solution(
+    sentences: Sequence[tuple[int, str, str, str]], report: LogReport
+) -> Iterator[tuple[int, str, str]]:
+    """Sentences without those of further talkers of the same kind and time.
+
+    The combined solution (GN) counts, else the most frequent talker of the kind. A receiver that sees satellites of
+    one system only goes over to that system's talker, so that the talker may change from time to time.
+    """
     counts: dict[str, Counter[str]] = {}
-    for _entry, talker, kind, _sentence in sentences:
+    times: list[int] = []  # of each sentence the number of its time, counted from 0
+    at_s, number = math.nan, 0
+    for _entry, talker, kind, sentence in sentences:
+        second_s = _second_of_day(kind, sentence) if kind not in _UNTIMED else math.nan
+        if not math.isnan(second_s) and second_s != at_s:
+            at_s, number = second_s, number + 1
+        times.append(number)
         if kind in _POSITIONS or kind == "GST":
             counts.setdefault(kind, Counter())[talker] += 1
-    return {kind: "GN" if "GN" in found else found.most_common(1)[0][0] for kind, found in counts.items()}
+    ranks = {
+        kind: {talker: (talker == "GN", count) for talker, count in found.items()} for kind, found in counts.items()
+    }
+    best: dict[tuple[int, str], str] = {}
+    for number, (_entry, talker, kind, _sentence) in zip(times, sentences, strict=True):
+        rank = ranks.get(kind)
+        if rank is not None and ((number, kind) not in best or rank[talker] > rank[best[number, kind]]):
+            best[number, kind] = talker
+    used: dict[str, set[str]] = {}
+    for (_number, kind), talker in best.items():
+        used.setdefault(kind, set()).add(talker)
+    for kind, talkers in used.items():
+        if len(talkers) > 1:
+            report.warn(
+                f"{kind} sentences come from {' and '.join(sorted(talkers))} at different times: they were taken to be "
+                "of one receiver; send the log of one receiver if there were several"
+            )
+    for number, (entry, talker, kind, sentence) in zip(times, sentences, strict=True):
+        if best.get((number, kind), talker) == talker:
+            yield entry, kind, sentence
 
 
 def _take(entry: int, kind: str, second_s: float, sentence: Any, reading: _Reading) -> None:
@@ -262,6 +291,11 @@ def _take_position(entry: int, kind: str, second_s: float, sentence: Any, readin
     if not _has_fix(kind, sentence):
         epoch.void = True
     elif not (math.isnan(lon_deg) or math.isnan(lat_deg)):
+        if max(abs(lon_deg - epoch.lon_deg), abs(lat_deg - epoch.lat_deg)) > _SAME_DEG:
+            reading.report.warn(
+                "sentences of one time have different positions, of which the last one was used; send the log of one "
+                "receiver if there were several"
+            )
         epoch.lon_deg, epoch.lat_deg = lon_deg, lat_deg
 
 

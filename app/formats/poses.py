@@ -18,7 +18,7 @@ from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, list_accepted
-from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, check_datum, has_zone
+from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, check_datum
 from app.formats.nmea import looks_like_nmea, read_nmea
 from app.formats.text import clean_text, read_number
 from app.inputs import Declaration, Name, Number
@@ -199,7 +199,6 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
             cure="name the columns so, or declare their names",
         )
     datums: set[str] = set()
-    zoned = True
     clock = declaration.times.of_column(
         (cells[places["time"]] for cells in log.rows() if cells is not None), "poses.clock.day_first"
     )
@@ -221,10 +220,8 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
             if not math.isnan(point.lon_deg):
                 check_datum(cells[places["crs"]], point.lon_deg, point.lat_deg)
             datums.add(cells[places["crs"]])
-        zoned = zoned and (":" not in cells[places["time"]] or has_zone(cells[places["time"]]))
+        report.note_zone(cells[places["time"]], declaration.times)
         yield point
-    if not zoned and not declaration.times.utc_offset_s:
-        report.warn("times without a zone were taken as UTC; declare the zone's offset if they are local")
 
 
 def _point_of(entry: int, cells: list[str], places: Mapping[str, int], clock: LogClock, decimal: str) -> PosePoint:
@@ -290,6 +287,7 @@ def read_gpx(source: PoseSource) -> Iterator[PosePoint]:
         report.entries += 1
         at = point.time
         written = None if at is None else at.isoformat()
+        report.note_zone(written, source.declaration.times)
         yield PosePoint(
             entry, source.declaration.times.read(written), float(point.longitude), float(point.latitude), _course(point)
         )

@@ -566,6 +566,7 @@ def _packet_from_record(
     written = payload_text(names[places["payload"]] if "payload" in places else "", declaration)
     packet = packet_from_values(entry, values, declaration.times, written)
     source.report.note_unread_time(values.get("time"), packet.received_at_s)
+    source.report.note_zone(values.get("time"), declaration.times)
     return packet
 
 

@@ -16,7 +16,7 @@ from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter
 from app.formats.format import Sample
-from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, has_zone
+from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport
 from app.formats.text import MAX_LINE, clean_text, numbered_lines, read_number, repeated_names
 from app.geodesy import check_lon_lat
 from app.inputs import Declaration, Name
@@ -335,7 +335,7 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
         report.warn(f"{source.sample.name} has several columns named {repeated!r}; the first is read")
     places = log.places(ALIASES, declaration.columns or {})
     written = payload_text(log.columns[places["payload"]] if "payload" in places else "", declaration)
-    zoned, clock = True, declaration.times
+    clock = declaration.times
     if "time" not in places:
         report.warn(
             f"{source.sample.name} has no column that is named as a time; its columns are {_shown(log.columns)}: "
@@ -350,18 +350,12 @@ def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
             if cells is None:
                 raise BrokenEntry("malformed", log.bad_row())
             values = {quantity: cells[place] for quantity, place in places.items()}
-            zoned = zoned and _names_zone(values.get("time", ""))
             packet = packet_from_values(entry, values, clock, written, decimal=log.dialect.decimal)
             report.note_unread_time(values.get("time"), packet.received_at_s)
+            report.note_zone(values.get("time"), clock)
             yield packet
         except BrokenEntry as broken:
             report.leave_out(entry, broken.kind, broken.reason)
-    if not zoned and not declaration.times.utc_offset_s:
-        report.warn("times without a zone were taken as UTC; declare the zone's offset if they are local")
-
-
-def _names_zone(text: str) -> bool:
-    return ":" not in text or has_zone(text)
 
 
 def payload_text(column: str, declaration: PacketDeclaration) -> PayloadText:

@@ -231,7 +231,7 @@ def _table(
     check_size(len(rows), len(names))
     columns = tuple([row.get(name) for row in rows] for name in names)
     xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
-    return SourceTable(kind, names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), crs, unit, Faults(faults))
+    return SourceTable(kind, names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), crs, unit, faults=Faults(faults))
 
 
 # === Surveys as Trimble JobXML: the reduced points of a job, with grid coordinates in metres and WGS 84 coordinates.

@@ -66,14 +66,14 @@ class RoadReference:
             height = np.full_like(height, np.nan)
         if self.declaration.origin is not None:
             return self._place_locally(vertices, height, self.declaration.origin)
-        first, second, name, known = vertices[:, 0], vertices[:, 1], self.name, True
+        first, second, name, problem = vertices[:, 0], vertices[:, 1], self.name, None
         if self.geographic:
             first = (first + 180.0) % 360.0 - 180.0
         else:
             own = _unit_m(_system(self.name))
             first, second = first * (self.unit_m / own), second * (self.unit_m / own)
         if not _has_code(self.name):
-            first, second, name, known = _to_geographic(self.name, first, second)
+            first, second, name, problem = _to_geographic(self.name, first, second)
         placed = place_positions(
             np.ascontiguousarray(first),
             np.ascontiguousarray(second),
@@ -85,8 +85,8 @@ class RoadReference:
             accuracy_m=accuracy_m,
         )
         bound, note = placed.transform_accuracy_m, placed.note
-        if not known:
-            bound, note = None, "the CRS of the file states no known datum"
+        if problem is not None:
+            bound, note = None, problem
         return PlacedRoad(
             placed.lon_deg,
             placed.lat_deg,
@@ -235,18 +235,34 @@ def _are_same(stated: str, declared: str) -> bool:
     return not _has_code(stated) and bool(_system(stated).equals(_system(declared), ignore_axis_order=True))
 
 
-def _to_geographic(name: str, first: Floats, second: Floats) -> tuple[Floats, Floats, str, bool]:
-    """Longitudes and latitudes of a system without a code, its geographic system, and whether its datum is known."""
+def _to_geographic(name: str, first: Floats, second: Floats) -> tuple[Floats, Floats, str, str | None]:
+    """Longitudes and latitudes of a system without a code, their geographic system, and why that is doubtful."""
     system = _system(name)
     geodetic = system.geodetic_crs
     assert geodetic is not None
+    if (bound := _with_shift(name)) is not None:
+        shifted = Transformer.from_crs(bound, _CRS84, always_xy=True).transform(first, second)
+        problem = "the CRS of the file is shifted to WGS 84 by its own +towgs84, whose accuracy is not stated"
+        return np.asarray(shifted[0]), np.asarray(shifted[1]), _CRS84, problem
     if system.is_projected:
         first, second = Transformer.from_crs(system, geodetic, always_xy=True).transform(first, second)
     if is_global(system):
-        return np.asarray(first), np.asarray(second), _CRS84, True
+        return np.asarray(first), np.asarray(second), _CRS84, None
     datum = geodetic.datum.name if geodetic.datum is not None else ""
     code = geographic_code(geodetic) or _DATUMS.get(datum.removesuffix(" ensemble"))
-    return np.asarray(first), np.asarray(second), code or _CRS84, code is not None
+    unknown = None if code else "the CRS of the file states no known datum"
+    return np.asarray(first), np.asarray(second), code or _CRS84, unknown
+
+
+def _with_shift(name: str) -> CRS | None:
+    """The system of a text whose parameters shift its datum to WGS 84; None of one without, or with zeros only."""
+    system = CRS.from_user_input(_checked(name))
+    while system.is_compound:
+        system = system.sub_crs_list[0]
+    is_shifted = (
+        system.is_bound and system.coordinate_operation is not None and any(system.coordinate_operation.towgs84)
+    )
+    return system if is_shifted else None
 
 
 _DATUMS = {"North American Datum 1983": "EPSG:4269", "European Terrestrial Reference System 1989": "EPSG:4258"}

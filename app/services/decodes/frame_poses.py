@@ -134,6 +134,7 @@ class FramePlaces:
         self._listed: Mapping[str, ListedFrame] = self._lists.frames.frames if self._lists.frames else {}
         self._track = self._lists.track or _track_of_list(self._listed)
         self.warnings = list(self._lists.warnings)
+        self._is_outside_noted = False
         if self._track is not None and len(self._track.time_s) and observed_at is not None:
             rollover = describe_rollover(float(self._track.time_s[0]), observed_at.timestamp())
             self.warnings += [rollover] if rollover else []
@@ -206,6 +207,17 @@ class FramePlaces:
             update={"coarse_position": pose.coarse_position, "heading_deg": pose.heading_deg}
         )
 
+    def _warn_of_times(self, track: PoseTrack, at: datetime) -> None:
+        """Warn, once a drive, that a frame was taken before or after the track: often a clock in local time."""
+        if not self._is_outside_noted:
+            self._is_outside_noted = True
+            first, last = (datetime.fromtimestamp(float(track.time_s[k]), UTC) for k in (0, -1))
+            self.warnings.append(
+                f"the track is from {first:%Y-%m-%dT%H:%M:%SZ} to {last:%Y-%m-%dT%H:%M:%SZ}, and a frame was taken at "
+                f"{at:%Y-%m-%dT%H:%M:%SZ}: such frames have no position of the track. If one of the clocks shows "
+                "local time, declare frames.poses.clock.utc_offset_s"
+            )
+
     def _warn(self, text: str) -> None:
         if text not in self.warnings:
             self.warnings.append(text)
@@ -220,7 +232,10 @@ class FramePlaces:
         after = min(after, len(track.time_s) - 1)
         between_s = float(track.time_s[after] - track.time_s[before])
         beyond_s = max(float(track.time_s[0]) - time_s, time_s - float(track.time_s[-1]))
-        if beyond_s > MAX_BEYOND_S or (beyond_s <= 0 and between_s > MAX_BRIDGE_S):
+        if beyond_s > MAX_BEYOND_S:
+            self._warn_of_times(track, at)
+            return None
+        if beyond_s <= 0 and between_s > MAX_BRIDGE_S:
             return None
         share = min(max((time_s - float(track.time_s[before])) / between_s, 0.0), 1.0) if between_s else 0.0
         lon = np.unwrap(track.lon_deg[[before, after]], period=360.0)

@@ -94,6 +94,19 @@ def test_a_track_a_week_rollover_behind_is_warned_of(client: httpx.Client, plate
     assert decode["frames"][0]["pose"]["source"] == "track"
 
 
+def test_frames_outside_the_times_of_their_track_are_reported(client: httpx.Client, plate: dict[str, Any]) -> None:
+    """A track in local time, of which its file says nothing, holds no frame."""
+    lon, lat = plate["position"]["lon_deg"], plate["position"]["lat_deg"]
+    track = "time,lon,lat\n" + "".join(f"2026-05-04T10:30:{k:02d}Z,{lon},{lat + k * 1e-4}\n" for k in range(5))
+    archive = pack({"0.png": GOOD, "1.png": GOOD, "poses.csv": track.encode()})
+    context = {"captured_at": "2026-05-04T08:30:01Z", "frames": {"rate_hz": 2.0}}
+    decode = wait_for(client, post_frame(client, archive, context, name="d.zip").headers["location"])
+    (warning,) = decode["warnings"]
+    assert "the track is from 2026-05-04T10:30:00Z to 2026-05-04T10:30:04Z, and a frame was taken at" in warning
+    assert "utc_offset_s" in warning
+    assert decode["frames"][0]["pose"] is None
+
+
 def test_a_list_that_cannot_be_read_fails_the_job_with_its_reason(client: httpx.Client, plate: dict[str, Any]) -> None:
     answer = post_frame(client, pack({"a.png": GOOD, "frames.csv": b"when,where\n1,2\n"}), near(plate), name="d.zip")
     decode = finished(client, answer.headers["location"])

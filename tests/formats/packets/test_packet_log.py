@@ -193,6 +193,9 @@ def test_what_times_do_not_say_is_said() -> None:
     assert "no time between 2000 and 2100" in untimed.report.warnings[0]
     local = read("id,lat,lon,timestamp\n1,42,-85,2026-03-16 13:39:32\n")
     assert "without a zone" in local.report.warnings[0]
+    local = read('{"id": 1, "lat": 42, "lon": -85, "time": "2026-03-16 13:39:32"}\n')
+    assert "without a zone" in local.report.warnings[0]
+    assert not read('{"id": 1, "lat": 42, "lon": -85, "time": "2026-03-16T13:39:32Z"}\n').report.warnings
 
 
 @pytest.mark.parametrize(

@@ -405,6 +405,38 @@ def test_the_combined_solution_of_several_talkers() -> None:
     assert track.lat_deg.tolist() == [pytest.approx(42.28345667)]
 
 
+def test_a_talker_that_changes_with_the_satellites_in_view() -> None:
+    text = nmea(
+        rmc("133932.00"),
+        gga("133932.00", lat="4217.00741"),
+        rmc("133933.00", talker="GP"),
+        gga("133933.00", talker="GP"),
+        rmc("133934.00"),
+        rmc("133934.00", talker="GP", lat="4217.10000"),
+    )
+    track, report = read(text)
+    assert (track.time_s - AT_S).tolist() == [0, 1, 2]
+    assert track.lat_deg == pytest.approx(42.2834566667)
+    assert any("RMC sentences come from GN and GP at different times" in warning for warning in report.warnings)
+
+
+def test_two_positions_of_one_time_are_reported() -> None:
+    apart = nmea(rmc("133932.00"), rmc("133932.00", lat="4217.10000"), rmc("133933.00", lat="4217.10000"))
+    assert any("sentences of one time have different positions" in w for w in read(apart)[1].warnings)
+    alike = nmea(rmc("133932.00"), gga("133932.00", lat="4217.007"), rmc("133933.00"))
+    assert not read(alike)[1].warnings
+
+
+def test_gpx_times_without_a_zone_are_reported() -> None:
+    text = GPX.format(POINT.format(""))
+    assert not read(text)[1].warnings
+    local = text.replace("Z</time>", "</time>")
+    assert "times without a zone were taken as UTC" in read(local)[1].warnings[0]
+    track, report = read(local, clock=LogClock(utc_offset_s=3600.0))
+    assert not report.warnings
+    assert track.time_s.tolist() == [AT_S - 3600]
+
+
 def test_a_datum_in_the_log_is_refused() -> None:
     good = "GPDTM,W84,,0.0,N,0.0,E,0.0,W84"
     assert len(read(nmea(good, rmc("133932.00")))[0].time_s) == 1

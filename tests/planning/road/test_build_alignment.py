@@ -291,6 +291,17 @@ def test_without_a_bound_a_road_is_unfit(crs: str) -> None:
     assert alignment.warnings
 
 
+def test_the_shift_of_a_datum_without_a_code_is_used() -> None:
+    """Without its +towgs84 the road would lie 130 m away."""
+    shift = "+towgs84=577.326,90.129,463.919,5.137,1.474,5.297,2.4232"
+    crs = f"+proj=tmerc +lat_0=0 +lon_0=9.1 +k=1 +x_0=500000 +y_0=0 +ellps=bessel {shift} +units=m +no_defs"
+    alignment = _declared(UTM, crs)
+    lane = alignment.lanes[0]
+    assert (lane.lon_deg[0], lane.lat_deg[0]) == pytest.approx((8.49836055726, 49.00593998998), abs=1e-9)  # by cs2cs
+    assert alignment.grade is LocalizationGrade.UNFIT
+    assert any("its own +towgs84" in warning for warning in alignment.warnings)
+
+
 def test_the_horizontal_part_of_a_compound_code_is_used() -> None:
     assert _declared(UTM, "EPSG:5555").crs == "EPSG:25832"
 
