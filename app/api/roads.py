@@ -17,6 +17,7 @@ from app.api.http.responses import (
     cursor_of,
     document_response,
     json_response,
+    no_cursor,
     page_response,
     versioned_response,
 )
@@ -250,19 +251,26 @@ def list_markers_on_road(
     to_m: _MetresQuery = None,
     min_offset_m: _MetresQuery = None,
     max_offset_m: _MetresQuery = None,
+    section: Annotated[
+        int | None, Query(ge=0, lt=2**31, description="One of the road's sections, from 0: measures may repeat.")
+    ] = None,
     limit: PageSize = 100,
     after: AfterLink = None,
 ) -> Response:
     """List the markers on a road.
 
-    In the order of their measures.
+    Along the road: section by section, in the order of their measures.
     """
+    first, separator, place = (after or "").partition(";")
+    if after is not None and not (separator and first.isdecimal() and len(first) < 10):
+        raise no_cursor()
     page, last = roads.markers(
         caller,
         road_id,
         measures_m=(from_m, to_m),
         offsets_m=(min_offset_m, max_offset_m),
-        after=cursor_of(after),
+        section=section,
+        after=(int(first), cursor_of(place)) if after is not None else (0, None),
         limit=limit,
     )
     return page_response(request, {"items": page}, after=last)

@@ -224,7 +224,7 @@ def _print(made: Plan, out: Path) -> None:
         colour = colours[finding.verdict]
         figure, limit = finding_figures(finding)
         verdict = f"[{colour}]{finding.verdict.value}[/]"
-        table.add_row(escape(finding.name), verdict, figure, limit, escape(finding_place(made, finding)))
+        table.add_row(escape(finding.name), verdict, figure, limit, escape(finding_place(finding)))
     if made.findings:
         console.print(table)
         for finding in made.findings:

@@ -305,11 +305,14 @@ def line_in_plan(plan_id: str, marker: PlannedMarker) -> str:
     return f"{plan_id} {marker.lane} {'left' if marker.offset_m > 0 else 'right'}".strip()
 
 
-def _placed_radios(radio: RadioSettings, markers: Sequence[PlannedMarker]) -> list[RadioSettings]:
+def _placed_radios(commitment: Commitment, markers: Sequence[PlannedMarker]) -> list[RadioSettings]:
     """The radio of each marker of a plan: in slots with a place that no marker near it has."""
+    radio = commitment.radio
     if radio.slots is None:
         return [radio] * len(markers)
-    along = sorted(range(len(markers)), key=lambda k: markers[k].station_m)
+    lanes = {lane.name: lane for lane in commitment.alignment.lanes}
+    at_m = [float(lanes[one.lane].value_at(lanes[one.lane].station_m, one.chainage_m)) for one in markers]
+    along = sorted(range(len(markers)), key=lambda k: at_m[k])
     lon_deg, lat_deg = (np.array([getattr(markers[k], name) for k in along]) for name in ("lon_deg", "lat_deg"))
     places = assign_places(ecef_from_wgs84(lon_deg, lat_deg), radio.slots.capacity)
     place_of = dict(zip(along, places.tolist(), strict=True))
@@ -410,7 +413,7 @@ class Cerpms(Family[CerpmIn, PlacedPosition]):
 
     def planned_rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
         """One row for each CERPM; in slots each with its place."""
-        radios = _placed_radios(commitment.radio, markers)
+        radios = _placed_radios(commitment, markers)
         for marker, radio in zip(markers, radios, strict=True):
             detail = marker.detail
             assert isinstance(detail, PlannedCerpm)

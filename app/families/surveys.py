@@ -58,7 +58,7 @@ def is_placed_again(row: MarkerRow, values: ColumnValues) -> bool:
 
 PLAN_METHOD = "placed by a plan"
 """Survey method of markers that nobody has surveyed yet."""
-_PLACE_IN_PLAN = ("number", "lane", "chainage_m", "offset_m")
+_PLACE_IN_PLAN = ("number", "lane", "station_m", "chainage_m", "offset_m")
 
 
 class PlannedRow(NamedTuple):
@@ -79,6 +79,12 @@ class Commitment:
     now: datetime
     codebook_id: str | None = None  # of the tags
     radio: RadioSettings = field(default_factory=RadioSettings)  # of the CERPMs
+    roads: Mapping[str, str] = field(default_factory=dict)  # names in the registry of roads of the alignment
+
+    def on_road(self, marker: PlannedMarker) -> ColumnValues:
+        """Columns of its road, and of its measure there: its station."""
+        name = self.alignment.lane(marker.lane).road
+        return {"road": self.roads.get(name, name) or None, "measure_m": round(marker.station_m, 4)}
 
     def original(self, marker: PlannedMarker) -> dict[str, object]:
         """Where a planned marker's position comes from."""
@@ -114,6 +120,7 @@ class Commitment:
             "realization": road.realization,
             "epoch": road.epoch,
             "survey_method": PLAN_METHOD,
+            **self.on_road(marker),
             "original": self.original(marker),
             **grade_columns(None, road.transform_accuracy_m, None),
         }

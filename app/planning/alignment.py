@@ -159,6 +159,12 @@ class Alignment:
         last = self.station_equations[number - 1]
         return last.ahead_m + station_m - last.distance_m
 
+    def stations_at(self, lane: Lane, chainage_m: npt.ArrayLike) -> list[float]:
+        """Displayed stations of places on a lane. [m]"""
+        return [
+            self.displayed_station_m(at) for at in np.atleast_1d(lane.value_at(lane.station_m, chainage_m)).tolist()
+        ]
+
 
 def format_station(station_m: float) -> str:
     """A station as metric drawings write it, e.g. ``1+234.56``."""

@@ -124,7 +124,7 @@ class PlannedMarker:
     # `chainage_m`, `offset_m`: [m] along the lane's centre line, and from it, left positive; of a tag its first magnet
     chainage_m: float
     offset_m: float
-    station_m: float  # [m] True distance along the road's reference line
+    station_m: float  # [m] as signs and drawings show it; of two places with the same station, chainages differ
     # `lon_deg`, `lat_deg`: [deg] WGS 84
     lon_deg: float
     lat_deg: float
@@ -143,13 +143,15 @@ class LeftOut:
     chainage_m: float
     reason: str  # a sentence for people
     moved_m: float | None = None  # [m] how far it was moved along the lane; None: left out
+    station_m: float | None = None  # [m] as signs and drawings show it; None in plans that were made without it
 
 
 @dataclass(frozen=True, slots=True)
 class PlanFinding(RadioFinding):
     """One check of a plan, at its worst place; `sentence` has the cure if it is not met."""
 
-    # `lane`, `station_m`, `lon_deg`, `lat_deg`: where the figure was found; None for figures of the whole plan
+    # `lane`, `station_m`, `lon_deg`, `lat_deg`: where the figure was found, the station as signs and drawings show it;
+    # None for figures of the whole plan
     lane: str | None = None
     station_m: float | None = None
     lon_deg: float | None = None
@@ -249,7 +251,7 @@ def _moved(plan: Plan, marker: PlannedMarker, surveyed: SurveyedPlace) -> Planne
         lat_deg=surveyed.lat_deg,
         heading_deg=marker.heading_deg if surveyed.heading_deg is None else surveyed.heading_deg,
         chainage_m=chainage,
-        station_m=float(lane.value_at(lane.station_m, chainage)),
+        station_m=plan.alignment.stations_at(lane, chainage)[0],
         offset_m=offset_m,
         detail=detail,
     )

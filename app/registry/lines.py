@@ -6,6 +6,7 @@ of its first marker.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -197,9 +198,13 @@ def widened(box: Box) -> list[Box]:
 # === Runs of CERPMs along one side of a lane.
 #
 # A run is two or more CERPMs of one road and one side of the lane, in the order of their measures, no two neighbours
-# more than `MAX_GAP_M` apart by measure. Retired ones, and those without a road or a measure, are in none.
+# more than `MAX_GAP_M` apart by measure, and none farther than their measures allow: where the measures of a road
+# repeat, two runs have them. Retired ones, and those without a road or a measure, are in none.
 
 
+_MOST_STRETCHED = 2.0  # [1] metres of road in a metre of measure; source: docs/roads.md, calibration
+_BESIDE_M = 10.0  # [m] farther for rounded measures, and for neighbours on two boundaries of one side
+_M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 _STREAMED = {"stream_results": True, "yield_per": 1000}
 
 
@@ -297,29 +302,38 @@ def _is_before(row: _CerpmRow, begin: LinePlace | None, *, or_at: bool) -> bool:
 def _cut(rows: Iterable[_CerpmRow], is_before: Callable[[_CerpmRow], bool]) -> Iterator[list[_CerpmRow]]:
     """Runs of rows in the order of roads and measures, but those that begin before; each as soon as it is complete."""
     begun: deque[_Run] = deque()
-    growing: dict[str, _Run] = {}
-    road = None
+    growing: list[_Run] = []
     for row in rows:
-        if row.road != road:
-            road = row.road
-            growing.clear()
-        run = growing.get(row.side)
-        if run is None or row.measure_m - run.rows[-1].measure_m > MAX_GAP_M:
-            run = growing[row.side] = _Run(not is_before(row), [])
+        growing = [run for run in growing if not _is_complete(run, row)]
+        near = [(apart_m, k) for k, run in enumerate(growing) if (apart_m := _apart_m(run.rows[-1], row)) is not None]
+        if near:
+            run = growing[min(near)[1]]
+        else:
+            run = _Run(not is_before(row), [])
+            growing.append(run)
             begun.append(run)
         if run.is_wanted:
             run.rows.append(row)
         else:
             run.rows = [row]
-        while begun and _is_complete(begun[0], growing, row):
+        while begun and _is_complete(begun[0], row):
             yield from _wanted(begun.popleft())
     while begun:
         yield from _wanted(begun.popleft())
 
 
-def _is_complete(run: _Run, growing: Mapping[str, _Run], row: _CerpmRow) -> bool:
+def _is_complete(run: _Run, row: _CerpmRow) -> bool:
     last = run.rows[-1]
-    return growing.get(last.side) is not run or row.measure_m - last.measure_m > MAX_GAP_M
+    return row.road != last.road or row.measure_m - last.measure_m > MAX_GAP_M
+
+
+def _apart_m(last: _CerpmRow, row: _CerpmRow) -> float | None:
+    """Distance from the last CERPM of a run to the next row; None if it is of another run. [m]"""
+    if row.side != last.side:
+        return None
+    east_m = ((row.lon_deg - last.lon_deg + 180.0) % 360.0 - 180.0) * math.cos(math.radians(row.lat_deg)) * _M_PER_DEG
+    apart_m = math.hypot(east_m, (row.lat_deg - last.lat_deg) * _M_PER_DEG)
+    return apart_m if apart_m <= _MOST_STRETCHED * (row.measure_m - last.measure_m) + _BESIDE_M else None
 
 
 def _wanted(run: _Run) -> Iterator[list[_CerpmRow]]:

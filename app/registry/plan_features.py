@@ -105,7 +105,7 @@ PLAN_FIELDS = (
     Field("lane", "string", _P.lane, "Name of the lane"),
     Field("side", "string", _P.side, "Side of the lane that a line magnet or a CERPM is on"),
     Field("chainage_m", "number", _P.chainage_m, "Along the lane [m]"),
-    Field("station_m", "number", _P.station_m, "True distance along the road's reference line [m]"),
+    Field("station_m", "number", _P.station_m, "Station as signs and drawings show it [m]"),
     Field("offset_m", "number", _P.offset_m, "From the lane's centre line, left positive [m]"),
     Field("heading_deg", "number", _P.heading_deg, "Direction of travel, clockwise from true north [deg]"),
     Field("height_m", "number", _P.height_m, "Height above vertical_datum [m]"),

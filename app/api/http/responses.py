@@ -142,7 +142,7 @@ def checked_id(after: str | None) -> str | None:
         It is no id.
     """
     if after is not None and not _ID.fullmatch(after):
-        raise _no_cursor()
+        raise no_cursor()
     return after
 
 
@@ -158,11 +158,12 @@ def cursor_of(after: str | None) -> tuple[float, str] | None:
         return None
     found = _PLACE.fullmatch(after)
     if found is None or not math.isfinite(float(found[1])):
-        raise _no_cursor()
+        raise no_cursor()
     return float(found[1]), found[2]
 
 
-def _no_cursor() -> InvalidParameter:
+def no_cursor() -> InvalidParameter:
+    """The error for a value of `after` that no page gave."""
     return InvalidParameter(
         "this is not where a page of this list ended",
         field="after",

@@ -191,7 +191,7 @@ def _planned_tag(commitment: Commitment, marker: PlannedMarker, detail: PlannedT
     lane = _planned_lane(commitment, np.column_stack([lon, lat]).tolist(), marker.height_m)
     new = MagnetIn(family="magnet", lane=lane, tag=tag)
     columns = magnet_columns(new, detail.tag, detail.meaning, commitment.rules, commitment.now)
-    return PlannedRow(marker.number, columns | {"original": commitment.original(marker)})
+    return PlannedRow(marker.number, columns | commitment.on_road(marker) | {"original": commitment.original(marker)})
 
 
 def _planned_line(commitment: Commitment, stretch: Sequence[PlannedMarker]) -> PlannedRow:
@@ -203,7 +203,8 @@ def _planned_line(commitment: Commitment, stretch: Sequence[PlannedMarker]) -> P
     lane, line = _planned_lane(commitment, points, height_m), LineIn(spacing_m=spacing_m, style=style)
     new = MagnetIn(family="magnet", lane=lane, line=line)
     columns = magnet_columns(new, detail.tag, None, commitment.rules, commitment.now)
-    return PlannedRow(stretch[0].number, columns | {"original": commitment.original(stretch[0])}, len(stretch))
+    columns |= commitment.on_road(stretch[0]) | {"original": commitment.original(stretch[0])}
+    return PlannedRow(stretch[0].number, columns, len(stretch))
 
 
 def _planned_lane(commitment: Commitment, points_deg: list[list[float]], height_m: float | None) -> LaneIn:

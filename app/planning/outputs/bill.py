@@ -267,13 +267,13 @@ def verdict_counts(plan: Plan) -> dict[Verdict, int]:
     return {verdict: counts.get(verdict, 0) for verdict in Verdict}
 
 
-def finding_place(plan: Plan, finding: PlanFinding) -> str:
+def finding_place(finding: PlanFinding) -> str:
     """Where a finding is: lane and displayed station; empty for the whole plan."""
     if finding.lane is None and finding.station_m is None:
         return ""
     station = ""
     if finding.station_m is not None:
-        station = f" at {format_station(plan.alignment.displayed_station_m(finding.station_m))}"
+        station = f" at {format_station(finding.station_m)}"
     return f"lane {finding.lane}{station}" if finding.lane is not None else station.strip()
 
 
@@ -315,13 +315,14 @@ def write_report(plan: Plan, missing_files: Mapping[str, str] | None = None) -> 
         lines += ["| check | verdict | figure | limit | where | result | source |", "|---|---|---:|---:|---|---|---|"]
     for finding in plan.findings:
         figure, limit = finding_figures(finding)
-        cells = (finding.name, finding.verdict.value, figure, limit, finding_place(plan, finding), finding.sentence,
+        cells = (finding.name, finding.verdict.value, figure, limit, finding_place(finding), finding.sentence,
                  finding.source)  # fmt: skip
         lines.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
     lines += ["", "## Left out and moved", ""]
     for left in plan.left_out[:_MAX_LEFT_OUT]:
         what = "left out" if left.moved_m is None else f"moved by {left.moved_m:.2f} m"
-        lines.append(f"- {left.family}, lane {_cell(left.lane)}, {left.chainage_m:.1f} m: {what}: {_cell(left.reason)}")
+        at = f"{left.chainage_m:.1f} m" if left.station_m is None else format_station(left.station_m)
+        lines.append(f"- {left.family}, lane {_cell(left.lane)}, {at}: {what}: {_cell(left.reason)}")
     if len(plan.left_out) > _MAX_LEFT_OUT:
         lines.append(f"- and {len(plan.left_out) - _MAX_LEFT_OUT} more, in plan.json")
     if not plan.left_out:
@@ -416,13 +417,13 @@ def _end_of_kilometre(markers: Sequence[PlannedMarker], start: int) -> int:
 
 
 def write_schedule_csv(plan: Plan) -> bytes:
-    """The schedule as CSV in UTF-8, one row a section; stations are displayed ones."""
+    """The schedule as CSV in UTF-8, one row a section."""
     stream = io.StringIO()
     writer = TableWriter(stream)
     writer.write_row(SCHEDULE_COLUMNS)
     for section in plan_schedule(plan):
         first, last = section.markers[0], section.markers[-1]
-        stations = [format_station(plan.alignment.displayed_station_m(m.station_m)) for m in (first, last)]
+        stations = [format_station(m.station_m) for m in (first, last)]
         writer.write_row(
             [
                 section.order, section.day or "", section.lane, *stations,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -33,7 +34,7 @@ from app.planning.rules import PlanRules
 from app.radio.settings import RadioSettings
 from app.values import Floats, JsonObject
 
-PLAN_FORMAT = "waymark-plan/1"
+PLAN_FORMAT = "waymark-plan/2"
 MAX_PLAN_BYTES = 500_000_000
 """Longest document. [bytes] Several times that of 500,000 markers."""
 _MAX_SAMPLES = 5_000_000  # of one array; 5,000 km of lane
@@ -161,7 +162,7 @@ class AlignmentDocument(_Part):
 class PlanDocument(_Part):
     """A plan; `counts` is a summary that is not read back."""
 
-    format: Literal["waymark-plan/1"]
+    format: Literal["waymark-plan/1", "waymark-plan/2"]  # stations of the first are true distances
     name: str
     counts: dict[str, int]
     rules: PlanRules
@@ -224,9 +225,16 @@ def read_plan(data: bytes) -> Plan:
         codebook = None if document.codebook is None else Codebook.from_document(document.codebook)
     except InvalidParameter as error:
         raise _unreadable(f"the codebook of the plan is damaged: {error.message}", "codebook", PLAN_FORMAT) from error
+    road, markers, findings = document.alignment.alignment(), document.markers, document.findings
+    if document.format != PLAN_FORMAT:
+        markers = tuple(replace(one, station_m=road.displayed_station_m(one.station_m)) for one in markers)
+        findings = tuple(
+            one if one.station_m is None else replace(one, station_m=road.displayed_station_m(one.station_m))
+            for one in findings
+        )
     return Plan(
-        document.name, document.alignment.alignment(), document.rules, document.markers, document.left_out,
-        document.findings, codebook, document.radio, document.optimum,
+        document.name, road, document.rules, markers, document.left_out, findings, codebook, document.radio,
+        document.optimum,
     )  # fmt: skip
 
 
@@ -269,7 +277,7 @@ def marker_feature(plan: Plan, marker: PlannedMarker) -> JsonObject:
         "code": marker.code,
         "purpose": marker.purpose.value,
         "lane": marker.lane,
-        "station": format_station(road.displayed_station_m(marker.station_m)),
+        "station": format_station(marker.station_m),
         "chainage_m": round(marker.chainage_m, 4),
         "offset_m": round(marker.offset_m, 4),
         "heading_deg": round(marker.heading_deg, 4),

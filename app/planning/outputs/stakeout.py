@@ -179,7 +179,7 @@ def _places(plan: Plan) -> list[_Place]:
     for marker in plan.markers:
         detail = marker.detail
         height = math.nan if marker.height_m is None else marker.height_m
-        station = format_station(road.displayed_station_m(marker.station_m))
+        station = format_station(marker.station_m)
         here = (marker.lon_deg, marker.lat_deg, height)
         name = str(marker.number)
         match detail:

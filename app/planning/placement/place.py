@@ -300,7 +300,12 @@ def place_plan(
             limit=f"{MAX_MARKERS} markers",
             cure="plan the road in sections, or with larger spacings",
         )
-    return Plan(name, alignment, rules, markers, tuple(placer.left_out), codebook=book)
+    by_name = {lane.name: lane for lane in lanes}
+    left_out = tuple(
+        replace(left, station_m=alignment.stations_at(by_name[left.lane], left.chainage_m)[0])
+        for left in placer.left_out
+    )
+    return Plan(name, alignment, rules, markers, left_out, codebook=book)
 
 
 def _chosen_lanes(alignment: Alignment, rules: PlanRules) -> list[Lane]:
@@ -416,7 +421,7 @@ class _Placer:
         chainage = np.array([site.chainage_m for site in sites])
         offset = np.array([site.offset_m for site in sites])
         lon, lat = (values.tolist() for values in lane.position_at(chainage, offset))
-        station = lane.value_at(lane.station_m, chainage).tolist()
+        station = self.alignment.stations_at(lane, chainage)
         heading = lane.heading_at(chainage).tolist()
         tilt = np.tan(lane.value_at(lane.superelevation_rad, chainage))
         height = (lane.value_at(lane.height_m, chainage) + offset * tilt).tolist()

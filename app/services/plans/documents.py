@@ -21,6 +21,7 @@ class WeakMarker(TypedDict):
     kind: str
     lane: str
     chainage_m: float
+    station_m: float
     passes: int
     read: int
     rate: float | None
@@ -190,6 +191,7 @@ class PreviewedMarker(TypedDict):
     lane: str
     chainage_m: float
     station_m: float
+    """As signs and drawings show it, after the station equations. [m]"""
     offset_m: float
     lon_deg: float
     lat_deg: float

@@ -17,6 +17,7 @@ from app.families.family import Family
 from app.families.surveys import PLANNED, Commitment, MarkerRules, PlannedRow
 from app.markers.magnet_design import Codebook
 from app.markers.reading import MarkerRow
+from app.planning.alignment import Alignment
 from app.planning.outputs.package import OutputOptions
 from app.planning.outputs.plan_document import read_plan
 from app.planning.plan import Plan, PlannedMarker, PlannedTag
@@ -32,6 +33,7 @@ from app.registry.plan_features import replace_planned
 from app.registry.plan_states import find_plan_states, has_status
 from app.registry.plans import ALIGNMENTS, PLANS, PlanRow, link_markers, list_built, list_existing
 from app.registry.resources import first_version
+from app.registry.roads import ROADS
 from app.registry.spatial import Box
 from app.services.access.access import Caller
 from app.services.access.audit import author_of, log_change
@@ -56,6 +58,7 @@ from app.services.plans.documents import (
 from app.services.plans.proofs import APPROVED, CHECKED, COMMITTED, DRAFT, PROVED, files_of
 from app.services.plans.tasks import MadePlan, compare_plan, make_plan, write_file_of_plan
 from app.services.ports import Blobs, Clock, DecoderProcesses
+from app.services.roads.documents import linear_references
 from app.values import JsonObject
 
 MAX_EXISTING = 200_000
@@ -448,6 +451,7 @@ def _log_plan(connection: sa.Connection, caller: Caller, action: str, row: PlanR
 
 
 _PART = 2000  # rows that are stored at a time, as by imports
+_MAX_ROAD = 200  # [character] of the name of a marker's road
 
 
 def _commit_markers(
@@ -461,7 +465,8 @@ def _commit_markers(
         The codebook of the plan was changed since.
     """
     codebook_id = _store_codebook(connection, caller, plan, now)
-    commitment = Commitment(row.id, plan.alignment, rules, now, codebook_id, plan.radio or RadioSettings())
+    roads = _registry_roads(connection, caller.agency_id, plan.alignment)
+    commitment = Commitment(row.id, plan.alignment, rules, now, codebook_id, plan.radio or RadioSettings(), roads)
     stored: list[tuple[int, str]] = []
     covered = 0
     author, detail = author_of(caller), {"markers": plan.counts}
@@ -473,6 +478,7 @@ def _commit_markers(
     ):
         for number, (family, part) in enumerate(_parts(commitment, plan.markers)):
             ids = new_ids(now, len(part), number)
+            _measure(connection, caller.agency_id, part)
             columns = _columns(part, ids, family.name, now)
             markers.add_markers(connection, entry, columns, kind=kind_of_new, why=f"plan {plan.name}")
             if family.has_index:
@@ -482,6 +488,28 @@ def _commit_markers(
             covered += sum(planned.covered for planned in part)
     link_markers(connection, caller.agency_id, row.id, stored)
     return len(stored), len(plan.markers) - covered
+
+
+def _registry_roads(connection: sa.Connection, agency_id: str, alignment: Alignment) -> dict[str, str]:
+    """Name in the registry of each road of an alignment: that of the registered road, else of the alignment.
+
+    Files name their roads ``1`` or ``CL``; an agency has one alignment of a name.
+    """
+    names = list(dict.fromkeys(lane.road for lane in alignment.lanes))
+    own = {name: f"{alignment.name}, {name}" if len(names) > 1 else alignment.name for name in names}
+    return {
+        name: name if name and ROADS.find(connection, agency_id, name=name) is not None else own[name][:_MAX_ROAD]
+        for name in names
+    }
+
+
+def _measure(connection: sa.Connection, agency_id: str, part: Sequence[PlannedRow]) -> None:
+    """Give rows on registered roads the measures and offsets of these; the others keep the stations of the plan."""
+    columns = [planned.columns for planned in part]
+    for own, found in zip(
+        columns, linear_references(connection, agency_id, columns, [one["measure_m"] for one in columns]), strict=True
+    ):
+        own |= found
 
 
 def _parts(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -296,6 +297,26 @@ class Route:
     def measure_of(self, foot: Foot) -> float:
         """Measure of a foot. [m]"""
         return self.measures.measure_at(foot.part, foot.chainage_m)
+
+    def section_ranges_m(self) -> list[tuple[float, float]]:
+        """Measures of each section, with those before it that are on no section; the ends are open. [m]"""
+        ends = [(float(one.measures_m[0]), float(one.measures_m[-1])) for one in self.measures.sections]
+        lows = [-math.inf, *(min(low, before) for (_, before), (low, _) in pairwise(ends))]
+        highs = [*(high for _, high in ends[:-1]), math.inf]
+        return list(zip(lows, highs, strict=True))
+
+    def sections_of(self, positions: Sequence[tuple[float, float]], measures_m: Sequence[float]) -> list[int]:
+        """Section of each position (lon_deg, lat_deg) with its measure: where the measure repeats, the nearest one."""
+        ranges = self.section_ranges_m()
+        found = [
+            [k for k, (low_m, high_m) in enumerate(ranges) if low_m <= measure_m <= high_m] for measure_m in measures_m
+        ]
+        several = [k for k, sections in enumerate(found) if len(sections) != 1]
+        for k, feet in zip(several, self.feet([positions[k] for k in several], MARKER_REACH_M), strict=True):
+            if feet:
+                foot = min(feet, key=lambda one: abs(self.measure_of(one) - measures_m[k]) + one.distance_m)
+                found[k] = [self.measures.section_at(foot.part, foot.chainage_m)]
+        return [sections[0] if sections else 0 for sections in found]
 
 
 def route_of(row: RoadRow) -> Route:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime, timedelta
+from itertools import islice
 
 import sqlalchemy as sa
 
@@ -217,23 +219,41 @@ class Roads:
         *,
         measures_m: Range = (None, None),
         offsets_m: Range = (None, None),
-        after: tuple[float, str] | None = None,
+        section: int | None = None,
+        after: tuple[int, tuple[float, str] | None] = (0, None),
         limit: int = 100,
     ) -> tuple[list[MarkerDocument], str | None]:
-        """A page of the markers on a road in the order of their measures, and where it ended."""
+        """A page of the markers along a road, section by section in the order of their measures, and where it ended.
+
+        Parameters
+        ----------
+        section : int, optional
+            Only those of one section, from 0.
+        after : tuple
+            Section, and measure and id there, where the page before ended.
+
+        Raises
+        ------
+        InvalidParameter
+            There is no such section.
+        """
+        rows: list[tuple[int, MarkerRow]] = []
         with self._database.read() as connection:
-            road = ROADS.get(connection, caller.agency_id, road_id).name
-            rows = store.list_on_road(
-                connection,
-                caller.agency_id,
-                road,
-                measures_m=measures_m,
-                offsets_m=offsets_m,
-                after=after,
-                limit=limit + 1,
-            )
-        page = [marker_document(row) for row in rows[:limit]]
-        return page, f"{page[-1]['measure_m']!r},{page[-1]['id']}" if len(rows) > limit else None
+            road = ROADS.get(connection, caller.agency_id, road_id)
+            ranges = route_of(road).section_ranges_m()
+            if section is not None and section >= len(ranges):
+                raise InvalidParameter(
+                    f"there is no section {section}",
+                    field="section",
+                    limit=f"0 to {len(ranges) - 1}",
+                    cure="GET the road: it lists its sections",
+                )
+            for number in range(after[0], len(ranges)) if section is None else [section]:
+                found = _on_section(connection, caller.agency_id, road, number, measures_m, offsets_m, after, limit)
+                rows += [(number, row) for row in islice(found, limit + 1 - len(rows))]
+        page = [marker_document(row) for _, row in rows[:limit]]
+        last = f"{rows[limit - 1][0]};{page[-1]['measure_m']!r},{page[-1]['id']}" if len(rows) > limit else None
+        return page, last
 
     # --- steps ------------------------------------------------------------------------------------------------------
 
@@ -332,3 +352,41 @@ def _is_same(row: MarkerRow, measure_m: float, offset_m: float) -> bool:
     if row.measure_m is None or row.offset_m is None:
         return False
     return bool(abs(row.measure_m - measure_m) < _SAME_M and abs(row.offset_m - offset_m) < _SAME_M)
+
+
+def _on_section(
+    connection: sa.Connection,
+    agency_id: str,
+    road: RoadRow,
+    number: int,
+    measures_m: Range,
+    offsets_m: Range,
+    after: tuple[int, tuple[float, str] | None],
+    at_once: int,
+) -> Iterator[MarkerRow]:
+    """Markers of one section in the order of their measures; where a measure repeats, the position decides."""
+    route = route_of(road)
+    ranges = route.section_ranges_m()
+    low_m, high_m = ranges[number]
+    bounds = (
+        max(low_m, -math.inf if measures_m[0] is None else measures_m[0]),
+        min(high_m, math.inf if measures_m[1] is None else measures_m[1]),
+    )
+    low, high = (bound if math.isfinite(bound) else None for bound in bounds)
+    place = after[1] if number == after[0] else None
+    while bounds[0] <= bounds[1]:
+        rows = store.list_on_road(
+            connection,
+            agency_id,
+            road.name,
+            measures_m=(low, high),
+            offsets_m=offsets_m,
+            after=place,
+            limit=at_once + 1,
+        )
+        measures = [row.measure_m or 0.0 for row in rows]
+        found = route.sections_of([(row.lon_deg, row.lat_deg) for row in rows], measures)
+        yield from (row for row, section in zip(rows, found, strict=True) if section == number)
+        if len(rows) <= at_once:
+            return
+        place = measures[-1], rows[-1].id

@@ -4474,6 +4474,7 @@ export interface components {
             lane: string;
             moved_m: number | null;
             reason: string;
+            station_m: number | null;
         };
         LeftOutEntryDocument: {
             entry: number;
@@ -7180,6 +7181,7 @@ export interface components {
             passes: number;
             rate: number | null;
             read: number;
+            station_m: number;
         };
         WebhookDocument: {
             /** Format: date-time */

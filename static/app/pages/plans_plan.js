@@ -93,9 +93,9 @@ function Loaded({ plan, onChanged }) {
         <${PlanView} profile=${profile} things=${things} pointedId=${pointed ?? item} onPoint=${setPointed} onChoose=${choose} note=${previewed ? t("plan.preview_on_map") : ""} />
         <${Tabs} label=${t("plan.parts")} of=${tabsOf(plan)} chosen=${tab} without=${["item", "sort", "columns"]} />
         <div class="tab">
-          ${tab === "checks" && html`<${ChecksTable} plan=${plan} profile=${profile} pointed=${pointed ?? item} onPoint=${setPointed} />`}
+          ${tab === "checks" && html`<${ChecksTable} plan=${plan} pointed=${pointed ?? item} onPoint=${setPointed} />`}
           ${tab === "markers" && html`<${MarkersTable} markers=${markers} proof=${plan.proof} chosen=${item} pointed=${pointed} onPoint=${setPointed} />`}
-          ${tab === "left_out" && html`<${LeftOutTable} plan=${plan} profile=${profile} />`}
+          ${tab === "left_out" && html`<${LeftOutTable} plan=${plan} />`}
           ${tab === "rules" && html`<${ChangeRules} plan=${plan} onChanged=${onChanged} onPreview=${setPreview} />`}
           ${tab === "proof" && html`<${ProofTab} plan=${plan} markers=${markers} pointed=${pointed ?? item} onPoint=${setPointed} onChanged=${onChanged} />`}
           ${tab === "built" && html`<${BuiltTab} plan=${plan} />`}

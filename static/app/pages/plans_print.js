@@ -42,9 +42,9 @@ export function PlanPrint({ plan, profile, markers, things }) {
     <div class="report">
       ${lanes.slice(0, 20).map((lane) => html`<${Strip} key=${lane.name} way=${lane} rows=${rows} label=${t("plan.along", { lane: lane.name })}
         items=${things.filter((thing) => thing.lane === lane.name).map((thing) => ({ ...thing, kind: thing.level ?? thing.kind, ...(thing.kind === "marker" ? {} : { family: "" }) }))} />`)}
-      <h2>${t("plan.checks")}</h2><${ChecksTable} plan=${plan} profile=${profile} />
+      <h2>${t("plan.checks")}</h2><${ChecksTable} plan=${plan} />
       ${plan.proof && html`<h2>${t("plan.proof")}</h2><${Proof} plan=${plan} proof=${plan.proof} markers=${markers} />`}
-      ${plan.left_out.length > 0 && html`<h2>${t("plan.left_out")}</h2><${LeftOutTable} plan=${plan} profile=${profile} />`}
+      ${plan.left_out.length > 0 && html`<h2>${t("plan.left_out")}</h2><${LeftOutTable} plan=${plan} />`}
       <h2>${t("markers.title")}</h2>
       <table>
         <thead><tr><th scope="col" class="number">${t("field.number")}</th><th scope="col">${t("field.family")}</th><th scope="col">${t("field.code")}</th><th scope="col">${t("field.lane")}</th><th scope="col" class="number">${t("field.station")}</th><th scope="col" class="number">${t("field.offset_m")}</th><th scope="col">${t("field.details")}</th></tr></thead>

@@ -9,6 +9,7 @@ import { Facts } from "../components/facts.js";
 import { bodyOf, FormFrame, loadSchema, SchemaField, TextField, useForm } from "../components/form.js";
 import { JobProgress } from "../components/job.js";
 import { Empty, Shown, useLoad } from "../components/load.js";
+import { stationText } from "../components/strip_scale.js";
 import { number, time } from "../format.js";
 import { may } from "../session.js";
 import { t, textOr } from "../texts/index.js";
@@ -86,10 +87,10 @@ export function Proof({ plan, proof, markers, pointed = null, onPoint }) {
     ${proof.weak_markers.length > 0 && html`
       <h3>${t("plan.weak")}</h3>
       <div class="table-scroll plain-table" tabindex="0" role="region" aria-label=${t("plan.weak")}><table>
-        <thead><tr><th scope="col">${t("proof.marker")}</th><th scope="col">${t("field.lane")}</th><th scope="col" class="number">${t("field.chainage_m")}</th><th scope="col" class="number">${t("proof.read")}</th><th scope="col">${t("proof.cause")}</th></tr></thead>
+        <thead><tr><th scope="col">${t("proof.marker")}</th><th scope="col">${t("field.lane")}</th><th scope="col" class="number">${t("field.station")}</th><th scope="col" class="number">${t("proof.read")}</th><th scope="col">${t("proof.cause")}</th></tr></thead>
         <tbody>${proof.weak_markers.map((weak) => {
           const marker = byNumber.get(weak.number);
-          return html`<tr class=${pointed === `w${weak.number}` ? "pointed" : undefined} onPointerEnter=${() => onPoint?.(`w${weak.number}`)} onPointerLeave=${() => onPoint?.(null)}><th scope="row">${marker ? markerName(marker) : weak.number}</th><td>${weak.lane}</td><td class="number">${number(weak.chainage_m, 2)}</td>
+          return html`<tr class=${pointed === `w${weak.number}` ? "pointed" : undefined} onPointerEnter=${() => onPoint?.(`w${weak.number}`)} onPointerLeave=${() => onPoint?.(null)}><th scope="row">${marker ? markerName(marker) : weak.number}</th><td>${weak.lane}</td><td class="number">${weak.station_m == null ? number(weak.chainage_m, 2) : stationText(weak.station_m)}</td>
             <td class="number">${t("proof.read_of", { read: weak.read, passes: weak.passes })}</td><td>${weak.cause ?? "–"}</td></tr>`;
         })}</tbody>
       </table></div>`}

@@ -4,6 +4,7 @@ import { html } from "htm/preact";
 
 import { Verdict } from "../components/badges.js";
 import { Empty } from "../components/load.js";
+import { stationText } from "../components/strip_scale.js";
 import { Table } from "../components/table.js";
 import { MISSING, number, text } from "../format.js";
 import { path, withQuery } from "../router.js";
@@ -11,15 +12,15 @@ import { t, textOr } from "../texts/index.js";
 import { figureText, LEVELS } from "./plans_preview.js";
 import { checkName, placeText } from "./plans_view.js";
 
-/** @typedef {import("./plans_view.js").Plan} Plan @typedef {import("./plans_view.js").Profile} Profile @typedef {import("./plans_view.js").Marker} Marker */
+/** @typedef {import("./plans_view.js").Plan} Plan @typedef {import("./plans_view.js").Marker} Marker */
 
 /** A limit of a check as people read it. @param {any} finding */
 export const limitText = (finding) => `${finding.relation === ">=" ? "≥" : finding.relation === "<=" ? "≤" : finding.relation} ${figureText({ ...finding, figure: finding.limit })}`;
 
 /**
- * @param {{ plan: { findings: any[] }, profile: Profile, pointed?: string | null, onPoint?: (id: string | null) => void }} props
+ * @param {{ plan: { findings: any[] }, pointed?: string | null, onPoint?: (id: string | null) => void }} props
  */
-export function ChecksTable({ plan, profile, pointed = null, onPoint }) {
+export function ChecksTable({ plan, pointed = null, onPoint }) {
   return html`
     <div class="table-frame"><div class="table-scroll checks-table" tabindex="0" role="region" aria-label=${t("plan.checks")}>
       <table>
@@ -28,7 +29,7 @@ export function ChecksTable({ plan, profile, pointed = null, onPoint }) {
           <tr class=${pointed === `c${k}` ? "pointed" : undefined} onPointerEnter=${() => onPoint?.(`c${k}`)} onPointerLeave=${() => onPoint?.(null)}>
             <th scope="row">${finding.lane && onPoint ? html`<a href=${withQuery(path.value, { tab: "checks", item: `c${k}` })}>${checkName(finding.name)}</a>` : checkName(finding.name)}</th>
             <td><${Verdict} level=${LEVELS[finding.verdict] ?? "none"}>${textOr(`verdict.${finding.verdict}`, finding.verdict)}</${Verdict}></td>
-            <td class="number">${figureText(finding)}</td><td class="number">${limitText(finding)}</td><td>${placeText(profile, finding)}</td>
+            <td class="number">${figureText(finding)}</td><td class="number">${limitText(finding)}</td><td>${placeText(finding)}</td>
             <td class="sentence">${finding.sentence}<br /><span class="hint small">${finding.source}</span></td>
           </tr>`)}</tbody>
       </table>
@@ -61,15 +62,15 @@ export function MarkersTable({ markers, proof = null, chosen = null, pointed = n
     onPoint=${onPoint && ((/** @type {Marker | null} */ row) => onPoint(row ? `m${row.number}` : null))} footer=${t("list.count", { count: number(markers.length) })} />`;
 }
 
-/** @param {{ plan: Plan, profile: Profile }} props */
+/** @param {{ plan: Plan }} props */
 export function LeftOutTable({ plan }) {
   if (!plan.left_out.length) return html`<${Empty} title=${t("plan.nothing_left_out")} />`;
   return html`
     <div class="table-frame"><div class="table-scroll" tabindex="0" role="region" aria-label=${t("plan.left_out")}>
       <table>
-        <thead><tr><th scope="col">${t("field.lane")}</th><th scope="col" class="number">${t("field.chainage_m")}</th><th scope="col">${t("field.family")}</th><th scope="col">${t("left_out.what")}</th><th scope="col">${t("field.reason")}</th></tr></thead>
+        <thead><tr><th scope="col">${t("field.lane")}</th><th scope="col" class="number">${t("field.station")}</th><th scope="col">${t("field.family")}</th><th scope="col">${t("left_out.what")}</th><th scope="col">${t("field.reason")}</th></tr></thead>
         <tbody>${plan.left_out.map((row) => html`
-          <tr><th scope="row">${row.lane}</th><td class="number">${number(row.chainage_m, 2)}</td><td>${textOr(`family.${row.family}`, row.family)}</td>
+          <tr><th scope="row">${row.lane}</th><td class="number">${row.station_m == null ? number(row.chainage_m, 2) : stationText(row.station_m)}</td><td>${textOr(`family.${row.family}`, row.family)}</td>
             <td><${Verdict} level=${row.moved_m === null ? "bad" : "warn"}>${row.moved_m === null ? t("left_out.left_out") : t("left_out.moved", { distance: number(row.moved_m, 2, "m") })}</${Verdict}></td><td class="sentence">${row.reason}</td></tr>`)}</tbody>
       </table>
     </div>

@@ -137,15 +137,8 @@ export function PlanView({ profile, things, pointedId, onPoint, onChoose, note =
   `;
 }
 
-/** @param {Profile} profile @param {Finding} finding */
-export function placeText(profile, finding) {
+/** @param {Finding} finding */
+export function placeText(finding) {
   if (!finding.lane) return t("plan.whole");
-  return finding.station_m === null ? finding.lane : `${finding.lane}, ${stationText(displayedStation(profile, finding))}`;
-}
-
-/** A check's station as drawings show it. @param {Profile} profile @param {Finding} finding */
-function displayedStation(profile, finding) {
-  const lane = profile.lanes.find(({ name }) => name === finding.lane);
-  if (!lane || finding.lon_deg === null || finding.lat_deg === null) return finding.station_m ?? 0;
-  return valueAt(lane.chainage_m, lane.station_m, chainageNear(lane, finding.lon_deg, finding.lat_deg));
+  return finding.station_m === null ? finding.lane : `${finding.lane}, ${stationText(finding.station_m)}`;
 }

@@ -18,9 +18,15 @@ ITEMS = "/ogc/collections/marker_lines/items"
 GEOD = Geod(ellps="WGS84")
 
 
-def _cerpm(client: httpx.Client, measure_m: float | None, side: str = "left", road: str | None = "A7") -> str:
-    """A CERPM on a straight road to the north, where its measure says."""
-    lon, lat, _ = GEOD.fwd(8.0, 47.0, 0.0, measure_m or 0.0)
+def _cerpm(
+    client: httpx.Client,
+    measure_m: float | None,
+    side: str = "left",
+    road: str | None = "A7",
+    along_m: float | None = None,
+) -> str:
+    """A CERPM on a straight road to the north, where its measure says, or at a distance along the road."""
+    lon, lat, _ = GEOD.fwd(8.0, 47.0, 0.0, (measure_m or 0.0) if along_m is None else along_m)
     body = {"family": "cerpm", "position": {"lon_deg": lon, "lat_deg": lat}, "side": side, "measure_m": measure_m}
     response = client.post("/v1/markers", json={name: v for name, v in {**body, "road": road}.items() if v is not None})
     assert response.status_code == 201, response.text
@@ -58,6 +64,21 @@ def test_runs_are_cut_at_gaps_sides_and_roads(client: httpx.Client) -> None:
     assert lats == sorted(lats)
     assert get(client, f"{ITEMS}/{left[1]}")["geometry"] == run["geometry"]
     assert client.get(f"{ITEMS}/{left[0]}").status_code == 404  # a CERPM of the run, not its first
+
+
+@pytest.mark.parametrize("repeated_m", [30.0, 300.0])
+def test_where_measures_repeat_there_are_two_runs(client: httpx.Client, repeated_m: float) -> None:
+    """After 400 m the measures go on at an earlier one: in their order, CERPMs of both stretches alternate."""
+    before = [_cerpm(client, m) for m in (340.0, 352.0, 364.0, 376.0, 388.0)]
+    after = [_cerpm(client, m + 400.0 - repeated_m, along_m=400.0 + m) for m in (4.0, 16.0, 28.0, 40.0)]
+    page = get(client, ITEMS)
+    assert set(ids(page)) == {before[0], after[0]}
+    counts = {line_id: _line(page, line_id)["properties"]["count"] for line_id in ids(page)}
+    assert counts == {before[0]: 5, after[0]: 4}
+    assert max(_line(page, line_id)["properties"]["longest_gap_m"] for line_id in ids(page)) == 12.0
+    first = get(client, ITEMS, limit=1)
+    link = next(link["href"] for link in first["links"] if link["rel"] == "next")
+    assert ids(client.get(link).json()) == [line_id for line_id in ids(page) if line_id not in ids(first)]
 
 
 def test_retired_ones_leave_their_run(client: httpx.Client) -> None:
@@ -164,9 +185,9 @@ def test_a_page_reads_no_more_than_it_needs(client: httpx.Client, monkeypatch: p
     read: list[Any] = []
     is_complete = lines._is_complete
 
-    def counting(run: Any, growing: Any, row: Any) -> bool:
+    def counting(run: Any, row: Any) -> bool:
         read.append(row.id)
-        return is_complete(run, growing, row)
+        return is_complete(run, row)
 
     monkeypatch.setattr(lines, "_is_complete", counting)
     first = get(client, ITEMS, limit=1)

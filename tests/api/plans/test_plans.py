@@ -305,6 +305,68 @@ def test_stakeout_and_exports_lie_on_the_axis_that_was_sent(
     assert exported == [pytest.approx(at, abs=2e-4) for at in sorted(points.values())]
 
 
+def test_a_road_with_its_own_stations_has_them_everywhere(client: httpx.Client, other_planner: httpx.Client) -> None:
+    """An axis of 800 m from station 1+000; at 1+300 stations go on from 1+100, and at the new 1+400 from 2+000."""
+    text = (
+        '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2"><Units><Metric linearUnit="meter"/></Units>'
+        '<CoordinateSystem epsgCode="25832"/><Alignments><Alignment name="CL" staStart="1000"><CoordGeom><Line><Start>'
+        "5428000 458000</Start><End>5428000 458800</End></Line></CoordGeom>"
+        '<StaEquation staInternal="1300" staBack="1300" staAhead="1100"/>'
+        '<StaEquation staInternal="1600" staBack="1400" staAhead="2000"/></Alignment></Alignments></LandXML>'
+    )
+
+    def shown(along_m: float) -> float:
+        return along_m + (1000 if along_m < 300 else 800 if along_m < 600 else 1400)
+
+    alignment = send_road(client, text.encode(), name="B 10, section 3").json()
+    rules = {"plates": {"spacing_m": 50}, "road": {"design_speed_kmh": 70, "lane_width_m": 3.5}, "cerpm": {}}
+    plan = make_plan(client, alignment, lines=None, tags=None, **rules)
+    url = f"/v1/plans/{plan['id']}"
+    planned = {marker["number"]: marker for marker in client.get(f"{url}/files/plan.json").json()["markers"]}
+    length_m = alignment["lanes"][0]["length_m"]  # on the ellipsoid; stations are distances of the grid
+    for marker in planned.values():
+        assert marker["station_m"] == pytest.approx(shown(marker["chainage_m"] * 800 / length_m), abs=0.001)
+    stations = {n: f"{int(m['station_m'] // 1000)}+{m['station_m'] % 1000:06.2f}" for n, m in planned.items()}
+    features = client.get(f"{url}/files/plan.geojson").json()["features"]
+    assert {f["id"]: f["properties"]["station"] for f in features if f["properties"]["kind"] == "marker"} == stations
+    staked = client.get(f"{url}/files/stakeout-pnezd.csv").text
+    assert all(f"STA {station}" in staked for station in stations.values())
+    served = client.get("/ogc/collections/plans/items", params={"limit": 1000}).json()["features"]
+    assert {f["properties"]["number"]: round(f["properties"]["station_m"], 3) for f in served} == {
+        number: round(marker["station_m"], 3) for number, marker in planned.items()
+    }
+    found = [finding for finding in plan["findings"] if finding["station_m"] is not None]
+    assert found
+    assert {round(finding["station_m"], 4) for finding in found} <= {round(m["station_m"], 4) for m in planned.values()}
+    assert any(f["station_m"] >= 2000 or f["station_m"] < 1400 for f in found)
+    assert other_planner.post(f"{url}/approve", headers={"If-Match": '"1"'}).status_code == 200
+    assert client.post(f"{url}/commit", headers={"If-Match": '"2"'}).status_code == 201
+    markers = client.get("/v1/markers", params={"limit": 1000, "family": "plate"}).json()["items"]
+    assert {marker["road"] for marker in markers} == {"B 10, section 3"}
+    plates = sorted(round(m["station_m"], 3) for m in planned.values() if m["family"] == "plate")
+    assert sorted(round(marker["measure_m"], 3) for marker in markers) == plates
+    twice = client.get(
+        "/v1/markers", params={"family": "plate", "road": "B 10, section 3", "from_m": 1100, "to_m": 1300}
+    ).json()["items"]
+    wanted = [m for m in planned.values() if m["family"] == "plate" and 1100 <= m["station_m"] <= 1300]
+    assert len(twice) == len(wanted)
+    assert {m["chainage_m"] < 300 for m in wanted} == {True, False}, "before the equation and after it"
+    none = client.get("/v1/markers", params={"road": "B 10, section 3", "from_m": 1410, "to_m": 1990}).json()["items"]
+    assert none == []
+    line = {"type": "LineString", "coordinates": [[458_000, 5_428_000], [458_800, 5_428_000]]}
+    points = [
+        {"measure_m": 1000, "vertex": 0},
+        {"measure_m": 1300, "ahead_m": 1100, "chainage_m": 300 * length_m / 800},
+        {"measure_m": 1400, "ahead_m": 2000, "chainage_m": 600 * length_m / 800},
+        {"measure_m": 2200, "vertex": 1},
+    ]
+    registered = created(
+        client, "/v1/roads", name="B 10, section 3", crs="EPSG:25832", geometry=line, calibration=points
+    )
+    assert registered["markers"]["left"] == 0
+    assert registered["markers"]["largest_change_m"] < 0.1
+
+
 @pytest.mark.parametrize(
     ("rules", "field"),
     [

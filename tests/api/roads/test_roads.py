@@ -227,6 +227,32 @@ def test_markers_on_a_road_get_their_measures_and_keep_their_places(client: http
     assert [m["id"] for answer in (page, rest) for m in answer.json()["items"]] == ids[:4]
 
 
+def test_markers_where_measures_repeat_are_listed_along_the_road(client: httpx.Client) -> None:
+    """Measures go on at 300 m after 500 m: each one between occurs twice, 200 m apart, and none from 900 m on."""
+    line = _line((0, 1_000))
+    spots = [_along(line, along_m, 2.0) for along_m in (100, 350, 450, 550, 650, 900)]
+    markers = [_marker(client, spot, road="B 3") for spot in spots]
+    points = [{"measure_m": 0, "vertex": 0}, {"measure_m": 500, "ahead_m": 300, "chainage_m": 500}]
+    road = _road(client, "B 3", line, calibration=points)
+    ids = [marker["id"] for marker in markers]
+    url = f"/v1/roads/{road['id']}/markers"
+    listed = client.get(url).json()["items"]
+    assert [m["id"] for m in listed] == ids
+    assert [round(m["measure_m"]) for m in listed] == [100, 350, 450, 350, 450, 700]
+    assert [m["id"] for m in client.get(f"{url}?from_m=340&to_m=460").json()["items"]] == ids[1:5]
+    assert [m["id"] for m in client.get(f"{url}?from_m=340&to_m=460&section=1").json()["items"]] == ids[3:5]
+    assert [m["id"] for m in client.get(f"{url}?section=0").json()["items"]] == ids[:3]
+    found, address = [], f"{url}?limit=2"
+    while address:
+        page = client.get(address)
+        found += [m["id"] for m in page.json()["items"]]
+        address = page.links["next"]["url"] if "next" in page.links else ""
+    assert found == ids
+    refused = client.get(f"{url}?section=2")
+    assert (refused.status_code, refused.json()["limit"]) == (422, "0 to 1")
+    assert client.get(f"{url}?after=1,2").status_code == 422
+
+
 def test_measures_follow_a_recalibration(client: httpx.Client) -> None:
     line = _line((200, 4_000))
     road = _road(client, "A 61", line)

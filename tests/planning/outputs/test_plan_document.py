@@ -79,7 +79,7 @@ def test_a_plan_of_an_earlier_release_is_read() -> None:
 
 def test_the_document_is_plain_json_with_a_summary() -> None:
     document = orjson.loads(write_plan(full_plan()))
-    assert document["format"] == "waymark-plan/1"
+    assert document["format"] == "waymark-plan/2"
     assert document["counts"] == full_plan().counts
     lane = document["alignment"]["lanes"][0]
     assert lane["length_m"] == pytest.approx(full_plan().alignment.lanes[0].length_m)
