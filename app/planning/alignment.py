@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 from pyproj import Geod
 
-from app.formats.alignments.geometry import BoundaryStyle, EventKind, StationEquation
+from app.formats.alignments.geometry import BoundaryStyle, EventKind, Stationing
 from app.geodesy import LocalizationGrade, grade_accuracy
 from app.values import Floats
 
@@ -130,8 +130,7 @@ class Alignment:
     # [m] horizontal accuracy of the transformation, the realization and the epoch; None if it is unknown
     transform_accuracy_m: float | None = 0.0
     declared_realization: str | None = None
-    start_station_m: float = 0.0  # [m] displayed station of the start of the reference line
-    station_equations: tuple[StationEquation, ...] = ()
+    stationing: Mapping[str, Stationing] = field(default_factory=dict)  # by road; without, true distances from 0
     warnings: tuple[str, ...] = ()
 
     @property
@@ -151,19 +150,10 @@ class Alignment:
                 return lane
         raise KeyError(name)
 
-    def displayed_station_m(self, station_m: float) -> float:
-        """Station as signs and drawings show it, after the station equations. [m]"""
-        number = bisect_right([equation.distance_m for equation in self.station_equations], station_m)
-        if number == 0:
-            return self.start_station_m + station_m
-        last = self.station_equations[number - 1]
-        return last.ahead_m + station_m - last.distance_m
-
     def stations_at(self, lane: Lane, chainage_m: npt.ArrayLike) -> list[float]:
-        """Displayed stations of places on a lane. [m]"""
-        return [
-            self.displayed_station_m(at) for at in np.atleast_1d(lane.value_at(lane.station_m, chainage_m)).tolist()
-        ]
+        """Stations of places on a lane, as signs and drawings show them. [m]"""
+        displayed_m = self.stationing.get(lane.road, Stationing()).displayed_m
+        return [displayed_m(at) for at in np.atleast_1d(lane.value_at(lane.station_m, chainage_m)).tolist()]
 
 
 def format_station(station_m: float) -> str:

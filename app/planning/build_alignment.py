@@ -119,8 +119,7 @@ def build_alignment(
         declaration.vertical_datum if has_heights else None,
         source.transform_accuracy_m,
         declaration.realization,
-        file.start_station_m,
-        file.station_equations,
+        file.stationing,
         tuple(warnings),
     )
 

@@ -68,7 +68,9 @@ def _page(template: str, texts: Texts, title: str, *, here: str, up: str, **valu
 
 
 def _facts(texts: Texts, marker: PublicMarker) -> Sequence[tuple[str, str]]:
-    measure = None if marker.measure_m is None else f"{marker.measure_m:.1f} m".replace(".", texts.decimal_point)
+    measure = (
+        None if marker.measure_m is None else f"km {marker.measure_m / 1000:.3f}".replace(".", texts.decimal_point)
+    )
     found = (
         (texts.code, marker.code),
         (texts.agency, marker.agency),

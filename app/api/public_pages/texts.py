@@ -67,7 +67,7 @@ GERMAN = Texts(
     status="Status",
     revision="Revision der Druckvorlage",
     road="Straße",
-    measure="Stationierung",
+    measure="Straßenkilometer",
     statuses={
         "planned": "geplant",
         "built": "eingebaut",
@@ -142,7 +142,7 @@ ENGLISH = Texts(
     status="Status",
     revision="Artwork revision",
     road="Road",
-    measure="Distance along the road",
+    measure="Kilometre of the road",
     statuses={
         "planned": "planned",
         "built": "installed",

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
 
@@ -108,6 +110,23 @@ class StationEquation:
     # `back_m`, `ahead_m`: [m] displayed stations before and after
     back_m: float
     ahead_m: float
+    falls: bool = False  # whether displayed stations fall from there on
+
+
+@dataclass(frozen=True, slots=True)
+class Stationing:
+    """Stations along a road as signs and drawings show them."""
+
+    start_m: float = 0.0  # [m] of the start of the reference line
+    equations: tuple[StationEquation, ...] = ()
+
+    def displayed_m(self, distance_m: float) -> float:
+        """Station at a true distance along the reference line. [m]"""
+        number = bisect_right([equation.distance_m for equation in self.equations], distance_m)
+        if number == 0:
+            return self.start_m + distance_m
+        last = self.equations[number - 1]
+        return last.ahead_m + (-1 if last.falls else 1) * (distance_m - last.distance_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +152,7 @@ class AlignmentFile:
     unit_m: float | None = 1.0
     events: tuple[EventGeometry, ...] = ()
     areas: tuple[AreaGeometry, ...] = ()
-    station_equations: tuple[StationEquation, ...] = ()
-    start_station_m: float = 0.0  # [m] displayed station of the start of the reference line
+    stationing: Mapping[str, Stationing] = field(default_factory=dict)  # by road; without, true distances from 0
     warnings: tuple[str, ...] = ()  # what was left out or repaired, in sentences for people
     earlier: EarlierTransformation | None = None  # of all coordinates, before they came into the file
 
@@ -175,11 +193,11 @@ class AlignmentDeclaration:
     ] = 0.0
 
     def __post_init__(self) -> None:
-        for field, value in (("unit", self.unit), ("height_unit", self.height_unit)):
+        for name, value in (("unit", self.unit), ("height_unit", self.height_unit)):
             if value not in (None, *METRES):
                 raise InvalidParameter(
                     f"there is no unit {str(value)[:40]!r}",
-                    field=field,
+                    field=name,
                     limit=", ".join(METRES),
                     cure="declare another",
                 )

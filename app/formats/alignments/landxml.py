@@ -30,6 +30,7 @@ from app.formats.alignments.geometry import (
     AlignmentFile,
     LaneGeometry,
     StationEquation,
+    Stationing,
     unit_length_m,
 )
 from app.formats.surveys.declaration import FEET, METRES
@@ -98,8 +99,7 @@ def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -
 
     Ends of elements are trusted, their directions (dir, dirStart) are not. Curves and spirals turn to the side that
     their length, PI and neighbours show, also against `rot`. Feet are those of the declaration or of the CRS. Geometry
-    and profile are in true distance; station equations only change what is displayed. Equations and start station are
-    those of the first alignment.
+    and profile are in true distance; station equations only change what is displayed.
 
     Returns
     -------
@@ -119,7 +119,7 @@ def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -
     unit_m, warnings = unit_length_m(_unit(root), declaration or AlignmentDeclaration(), crs)
     scale = _Scale(unit_m, _height_unit_m(root, unit_m), (0.0, 0.0), named)
     lanes: list[LaneGeometry] = []
-    stations: list[tuple[float, tuple[StationEquation, ...]]] = []
+    stationing: dict[str, Stationing] = {}
     vertices = 0
     for number, element in enumerate(root.iterfind("Alignments/Alignment"), 1):
         name = _name(element, number, {lane.name for lane in lanes})
@@ -135,7 +135,8 @@ def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -
         if curve is None:
             warnings.append(f"{place}: its elements have no length; it is left out.")
             continue
-        stations.append((start * scale.unit_m, _equations(element, start, curve.end_s, scale, place, warnings)))
+        equations = _equations(element, start, curve.end_s, scale, place, warnings)
+        stationing[name] = Stationing(start * scale.unit_m, equations)
         lane = _lane(curve, _profile(element, start, curve.end_s, scale, place, warnings), scale, name)
         vertices += 0 if lane.station_m is None else len(lane.station_m)
         if vertices > MAX_VERTICES:
@@ -147,16 +148,13 @@ def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -
             "one or more",
             "export the alignments as well",
         )
-    if any(equations for _, equations in stations[1:]):
-        warnings.append("Station equations of the second and further alignments are left out.")
     return AlignmentFile(
         format="landxml",
         lanes=tuple(lanes),
         crs=crs,
         crs_problem=problem,
         unit_m=scale.unit_m,
-        station_equations=stations[0][1],
-        start_station_m=stations[0][0],
+        stationing=stationing,
         warnings=tuple(warnings),
     )
 
@@ -461,22 +459,21 @@ def _equations(
 ) -> tuple[StationEquation, ...]:
     """Station equations in the order of the line. Without staInternal, the distance follows from staBack."""
     found: list[StationEquation] = []
-    distance, ahead = 0.0, start
+    distance, ahead, sign = 0.0, start, 1.0
     for element in alignment.iterfind("StaEquation"):
         where = f"{place}, StaEquation {element.get('staInternal') or element.get('staBack') or '?'}"
-        if element.get("staIncrement") == "decreasing":
-            warnings.append(f"{where}: stations that decrease along the line are not displayed as such.")
         new_ahead = attribute(element, "staAhead", where)
         if element.get("staInternal") is None:
-            at = distance + attribute(element, "staBack", where) - ahead
+            at = distance + sign * (attribute(element, "staBack", where) - ahead)
         else:
             at = attribute(element, "staInternal", where) - start
-        back = attribute(element, "staBack", where, ahead + at - distance)
+        back = attribute(element, "staBack", where, ahead + sign * (at - distance))
         if not (distance <= at and at * scale.unit_m <= length_m + GAP_M):
             warnings.append(f"{where}: it lies outside the line, or before the one before; it is left out.")
             continue
-        distance, ahead = at, new_ahead
-        found.append(StationEquation(at * scale.unit_m, back * scale.unit_m, new_ahead * scale.unit_m))
+        falls = element.get("staIncrement") == "decreasing"
+        distance, ahead, sign = at, new_ahead, -1.0 if falls else 1.0
+        found.append(StationEquation(at * scale.unit_m, back * scale.unit_m, new_ahead * scale.unit_m, falls))
     return tuple(found)
 
 

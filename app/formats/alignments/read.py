@@ -21,6 +21,7 @@ from app.formats.alignments.geometry import (
     EarlierTransformation,
     LaneGeometry,
     StationEquation,
+    Stationing,
 )
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
 from app.formats.xml_tree import xml_head
@@ -227,8 +228,7 @@ def read_registered_road(data: bytes) -> AlignmentFile:
         "road",
         tuple(_lanes(road, axes, chainages)),
         "OGC:CRS84",
-        station_equations=tuple(_equations(measures)),
-        start_station_m=float(measures.sections[0].measures_m[0]),
+        stationing={road.name: Stationing(float(measures.sections[0].measures_m[0]), tuple(_equations(measures)))},
         unit_m=None,
         earlier=earlier,
     )

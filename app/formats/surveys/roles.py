@@ -11,7 +11,7 @@ import numpy as np
 
 from app.errors import InvalidParameter
 from app.formats.surveys.declaration import NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
-from app.formats.surveys.table import Change, Detected, Fault, SourceTable, warn
+from app.formats.surveys.table import STATION, Change, Detected, Fault, SourceTable, warn
 from app.formats.text import normal_name
 from app.markers.reading import STATUSES
 
@@ -35,6 +35,7 @@ _NAMES = {
         "no", "nr", "punkt", "punktnummer", "punktnr", "pnr", "pkt", "pktnr", "station", "punto", "id",
     ),
     "code": ("code", "digits", "number", "registrynumber"),
+    "measure_m": ("measure", "chainage", "kilometrierung", "stationierung", "station", "km"),
     "description": ("description", "desc", "d", "descr", "beschreibung", "bemerkung", "remark", "remarks", "notes"),
 }  # fmt: skip
 """Names of columns as survey software writes them, in English, German and Spanish; the first that is there is taken."""
@@ -46,6 +47,8 @@ _MAX_NAME = 100  # [character] of a name that are looked at
 _SAMPLE = 2000  # values by which a column is recognised
 _MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows
 _MAX_SHOWN = 20  # names in a report
+_IN_METRES = re.compile(r"(?:_m|[\[(]\s*m\s*[\])])\s*$", re.IGNORECASE)  # at the end of a name
+_NUMBER = r"[+-]?[0-9.,]+(?:[eE][+-]?[0-9]+)?"
 _SIDES = ("left", "right", "unknown")
 
 
@@ -137,7 +140,7 @@ def _detected(
         name = source.names[column]
         if name in taken or column in used:
             continue
-        evidence, fits = _evidence(source.columns[column], role, code_form)
+        evidence, fits = _evidence(source.columns[column], role, name, code_form)
         shown = f"{name.strip()[:60]!r}"
         if fits:
             if source.has_names:
@@ -160,7 +163,7 @@ def _detected(
 
 def _named(source: SourceTable, role: str, declaration: ImportDeclaration) -> Iterator[int]:
     """Columns with a usual name of the role, the most usual name first."""
-    if role in NUMBER_ROLES:  # names of ours, with their units
+    if role in NUMBER_ROLES and role not in _NAMES:  # names of ours, with their units
         yield from (k for k, name in enumerate(source.names) if name.strip().lower() == role)
         return
     wanted = _NAMES.get(role, (role,))
@@ -172,7 +175,7 @@ def _named(source: SourceTable, role: str, declaration: ImportDeclaration) -> It
         yield from (k for k, other in enumerate(names) if other == name)
 
 
-def _evidence(cells: Sequence[object], role: str, code_form: CodeForm | None) -> tuple[str, bool]:
+def _evidence(cells: Sequence[object], role: str, name: str, code_form: CodeForm | None) -> tuple[str, bool]:
     """What the values show about a role, and whether they fit it."""
     fits: Callable[[str], object]
     if role == "code" and code_form is not None:
@@ -180,8 +183,17 @@ def _evidence(cells: Sequence[object], role: str, code_form: CodeForm | None) ->
     elif role in ("status", "side"):
         known = STATUSES if role == "status" else _SIDES
         fits, form = lambda text: text.lower() in known, f"one of {', '.join(known)}"
+    elif role == "measure_m" and _IN_METRES.search(name):
+        fits, form = re.compile(rf"{_NUMBER}|{STATION.pattern}").fullmatch, "a number"
+    elif role == "measure_m":  # numbers may be metres, kilometres or names of points
+        if not any(STATION.fullmatch(text) for text in _sample(cells)):
+            return "", False
+        fits, form = STATION.fullmatch, "kilometres and metres such as 12+345.67"
+    elif role == "point":
+        values = list(_sample(cells))
+        return "", sum(1 for text in values if STATION.fullmatch(text)) <= _MIN_SHARE * len(values)
     elif role in NUMBER_ROLES:
-        fits, form = re.compile(r"[+-]?[0-9.,]+(?:[eE][+-]?[0-9]+)?").fullmatch, "a number"
+        fits, form = re.compile(_NUMBER).fullmatch, "a number"
     else:
         return "", True
     values = list(_sample(cells))

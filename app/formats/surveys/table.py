@@ -266,6 +266,11 @@ _HEMISPHERE = re.compile(r"\s*(?:([NSEWO])\s*([0-9.]+)|([0-9.]+)\s*°?\s*([NSEWO
 _WITH_UNIT = re.compile(r"\s*([+-]?[0-9.]+)\s*(m|ft|us-?ft|sft|feet|'|cm|mm|km)\.?\s*", re.IGNORECASE)
 
 
+STATION = re.compile(r"([+-]?)([0-9]{1,6})\+([0-9]{3}(?:[.,][0-9]*)?)")
+"""A measure as kilometres and metres, 12+345.67. Two digits behind the sign are stations of 100 ft, which are none."""
+_STATION_100_FT = re.compile(r"[+-]?[0-9]+\+[0-9]{2}(?:[.,][0-9]*)?")
+
+
 class NumberForm(NamedTuple):
     """How numbers are written: the decimal sign, and the sign between groups of three digits, or none."""
 
@@ -415,6 +420,9 @@ def _read_one(cell: object, field: str, row: int, form: NumberForm, required: bo
         value = float(plain)
         if np.isfinite(value):
             return value
+    if field == "measure_m" and (found := STATION.fullmatch(text.strip()[:_MAX_SHOWN])):
+        metres = 1000.0 * int(found[2]) + float(found[3].replace(",", "."))
+        return -metres if found[1] == "-" else metres
     return _fault_of(text, field, row, form.decimal)
 
 
@@ -427,6 +435,9 @@ def _fault_of(text: str, field: str, row: int, decimal: str) -> Fault:
     if _GROUPED.fullmatch(text):
         cure = f"write {re.sub(r'[^0-9.+-]', '', text)}"
         return Fault(row, field, "grouped_digits", f"{field} is {shown}: digits in groups", cure)
+    if field == "measure_m" and _STATION_100_FT.fullmatch(text):
+        message = f"{field} is {shown}: a station of 100 ft, or of metres with a digit missing"
+        return Fault(row, field, "station_of_100_ft", message, "write metres, or kilometres and metres: 12+345.67")
     if (found := _HEMISPHERE.fullmatch(text)) is not None:
         letter, number = found[1] or found[4], found[2] or found[3]
         sign = "-" if letter.upper() in "SW" else ""

@@ -8,12 +8,12 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import orjson
-from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError, model_validator
 from shapely import LineString, get_coordinates, simplify
 
 from app.encoders.cerpm import MAX_PROGRAMS, MarkerProgram, write_programs_csv
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import BoundaryStyle, StationEquation
+from app.formats.alignments.geometry import BoundaryStyle, StationEquation, Stationing
 from app.markers.cerpm import HEIGHT_M, KEY_BYTES, CerpmMessage, LaneSide
 from app.markers.magnet_design import Codebook
 from app.planning.alignment import Alignment, AvoidedArea, Lane, RoadEvent, format_station
@@ -122,6 +122,9 @@ class AreaDocument(_Part):
     ring_deg: list[tuple[float, float]]
 
 
+_FORMER = ("start_station_m", "station_equations")
+
+
 class AlignmentDocument(_Part):
     """The road of a plan."""
 
@@ -137,14 +140,15 @@ class AlignmentDocument(_Part):
     vertical_datum: str | None
     transform_accuracy_m: float | None
     declared_realization: str | None = None
-    start_station_m: float
-    station_equations: tuple[StationEquation, ...]
+    stationing: dict[str, Stationing] = {}
+    start_station_m: float = Field(0.0, exclude=True)  # of plans of the first format
+    station_equations: tuple[StationEquation, ...] = Field((), exclude=True)
     warnings: tuple[str, ...]
 
     @classmethod
     def of(cls, road: Alignment) -> AlignmentDocument:
         """The document of an alignment."""
-        same = {name: getattr(road, name) for name in cls.model_fields if name not in ("lanes", "areas")}
+        same = {name: getattr(road, name) for name in cls.model_fields if name not in ("lanes", "areas", *_FORMER)}
         areas = [
             AreaDocument(kind=area.kind, ring_deg=[(lon, lat) for lon, lat in area.ring_deg.tolist()])
             for area in road.areas
@@ -153,7 +157,7 @@ class AlignmentDocument(_Part):
 
     def alignment(self) -> Alignment:
         """The alignment of the document."""
-        own = ("lanes", "areas", "grade")
+        own = ("lanes", "areas", "grade", *_FORMER)
         same = {name: getattr(self, name) for name in type(self).model_fields if name not in own}
         areas = tuple(AvoidedArea(area.kind, np.array(area.ring_deg).reshape(-1, 2)) for area in self.areas)
         return Alignment(lanes=tuple(lane.lane() for lane in self.lanes), areas=areas, **same)
@@ -227,9 +231,11 @@ def read_plan(data: bytes) -> Plan:
         raise _unreadable(f"the codebook of the plan is damaged: {error.message}", "codebook", PLAN_FORMAT) from error
     road, markers, findings = document.alignment.alignment(), document.markers, document.findings
     if document.format != PLAN_FORMAT:
-        markers = tuple(replace(one, station_m=road.displayed_station_m(one.station_m)) for one in markers)
+        former = Stationing(document.alignment.start_station_m, document.alignment.station_equations)
+        road = replace(road, stationing={lane.road: former for lane in road.lanes})
+        markers = tuple(replace(one, station_m=former.displayed_m(one.station_m)) for one in markers)
         findings = tuple(
-            one if one.station_m is None else replace(one, station_m=road.displayed_station_m(one.station_m))
+            one if one.station_m is None else replace(one, station_m=former.displayed_m(one.station_m))
             for one in findings
         )
     return Plan(

@@ -295,7 +295,7 @@ class _Row:
         """Numbered stations below the road, and ticks between them."""
         reference, minor = self.strip.reference, SCALES[self.strip.scale] / _TICKS
         ends = np.array([self._at(end)[0] for end in (self.strip.from_m, self.strip.to_m)])
-        for equation in self.plan.alignment.station_equations:
+        for equation in reference.stationing.equations:
             at = float(np.interp(equation.distance_m, reference.distance_m, reference.along_m, -1.0, -1.0))
             if at >= 0 and self.strip.from_m <= at <= self.strip.to_m:
                 self._draw_equation(at, equation)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import scipy
 
 from app.errors import InvalidParameter
+from app.formats.alignments.geometry import Stationing
 from app.geodesy.frames import ecef_from_wgs84, metres_per_radian
 from app.planning.alignment import Alignment, Lane
 from app.planning.plan import Plan
@@ -80,15 +81,21 @@ class Reference:
         jumps = np.flatnonzero(np.abs(np.diff(self.station_m)) > _JUMP_M) + 1
         places, stations = [np.zeros(0)], [np.zeros(0)]
         for run in np.split(np.arange(len(self.station_m)), jumps):
-            here = np.maximum.accumulate(self.station_m[run])
+            sign = 1.0 if self.station_m[run[-1]] >= self.station_m[run[0]] else -1.0
+            here = np.maximum.accumulate(sign * self.station_m[run])
             wanted = np.arange(np.ceil((here[0] - 1e-6) / step_m), np.floor((here[-1] + 1e-6) / step_m) + 1) * step_m
             places.append(np.interp(wanted, here, self.along_m[run]))
-            stations.append(wanted)
+            stations.append(sign * wanted)
         return np.concatenate(places), np.concatenate(stations)
 
     def station_at(self, along_m: float) -> float:
         """Displayed station of a place. [m]"""
-        return self.road.displayed_station_m(float(np.interp(along_m, self.along_m, self.distance_m)))
+        return self.stationing.displayed_m(float(np.interp(along_m, self.along_m, self.distance_m)))
+
+    @property
+    def stationing(self) -> Stationing:
+        """Stations of the lane's road."""
+        return self.road.stationing.get(self.lane.road, Stationing())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,7 +221,7 @@ def _reference(
             beside.append(BesideLane.of(other, nearest_m))
     order = np.argsort(along[nearest], kind="stable")
     way = slice(None, None, -1) if falls else slice(None)
-    displayed = np.array([road.displayed_station_m(station) for station in lane.station_m[way].tolist()])
+    displayed = np.array(road.stations_at(lane, lane.chainage_m[way]))
     lon = np.unwrap(lane.lon_deg[way], period=360.0)
     return Reference(
         road, lane, np.ascontiguousarray(along[way]), np.ascontiguousarray(lane.station_m[way]), lon,

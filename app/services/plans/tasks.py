@@ -170,7 +170,7 @@ def _lane_profile(road: Alignment, lane: Lane, samples: int) -> LaneProfile:
         "right_style": str(lane.right_style),
         "line": lane_points_deg(lane),
         "chainage_m": _rounded(lane.chainage_m[at], 3),
-        "station_m": [round(road.displayed_station_m(station), 3) for station in lane.station_m[at].tolist()],
+        "station_m": [round(station, 3) for station in road.stations_at(lane, lane.chainage_m[at])],
         "curvature_per_m": _rounded(_greatest_near(lane.curvature_per_m, at), 7),
         "grade": _rounded(lane.grade[at], 5),
         "design_speed_kmh": _rounded(speed, 2) if np.isfinite(speed).all() else None,

@@ -6,7 +6,7 @@ whether anything is, follows from the faults of each row.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,9 @@ from app.families import get_family
 from app.families.family import Registration
 from app.families.surveys import PLANNED, MarkerRules, RowCodes, Rows, SurveyImport
 from app.formats.surveys.roles import CodeForm
-from app.formats.surveys.table import Fault, Faults, Severity
+from app.formats.surveys.table import Fault, Faults, Severity, warn
 from app.markers.reading import MarkerRow
+from app.planning.alignment import format_station
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, EntryRow, find_head, recording
 from app.registry.bulk_load import LARGE, Columns
@@ -68,6 +69,7 @@ READ, SETTLED = 0.3, 0.5
 """How far an import is when its file was read, and when it goes to store what is good."""
 _BUSY_WAIT_S = 10.0
 _PART = 2000  # rows that are stored at a time
+_MEASURES_AGREE_M = 5.0  # [m] between a measure that a survey states and that of the position; posts stand so exactly
 _ALWAYS_WARNED = {"place_by_area_only"}  # every survey of a new road gets this warning, however well it is declared
 
 
@@ -234,9 +236,36 @@ class _Import:
 
         neighbours, registered = list_neighbours(connection, agency_id, self.survey)
         self.faults.add(check_location(self.survey, self.declaration, neighbours, is_known))
+        self.faults.add(self._check_measures(connection))
         duplicates = self._duplicates(registered)
         self.faults.add(duplicates)
         return _Checked(find_head(connection, agency_id), frozenset(duplicates))
+
+    def _check_measures(self, connection: sa.Connection) -> Iterator[Fault]:
+        """Rows whose measure is not that of their position on the registered road that they name."""
+        placed, measures = self.survey.placed, self.survey.table.numbers.get("measure_m")
+        if measures is None:
+            return
+        named = self.survey.table.texts.get("road")
+        known = np.flatnonzero(np.isfinite(measures) & placed.placed)
+        for start in range(0, len(known), _PART):
+            rows = known[start : start + _PART].tolist()
+            places = [
+                {
+                    "road": (named[row] if named is not None else "") or self.declaration.road,
+                    "lon_deg": float(placed.lon_deg[row]),
+                    "lat_deg": float(placed.lat_deg[row]),
+                }
+                for row in rows
+            ]
+            found = linear_references(connection, self.caller.agency_id, places, measures[rows].tolist())
+            for row, reference in zip(rows, found, strict=True):
+                at_m = reference.get("measure_m")
+                if at_m is not None and abs(at_m - measures[row]) > _MEASURES_AGREE_M:
+                    message = f"the measure is {format_station(measures[row])}, the position lies at"
+                    message += f" {format_station(at_m)} on the registered road"
+                    cure = "check the measure and the road's calibration; rows without a measure get that of the road"
+                    yield warn(row + 1, "measure_m", "measure_disagrees", message, cure)
 
     def _duplicates(self, registered: RegisteredPoints) -> list[Fault]:
         sha256 = self.request.file.sha256
@@ -363,7 +392,7 @@ class _Import:
         names = ("road", "lon_deg", "lat_deg")
         rows = [dict(zip(names, row, strict=True)) for row in zip(*map(columns.values, names), strict=True)]
         measures, offsets = columns.values("measure_m"), columns.values("offset_m")
-        found = linear_references(connection, self.caller.agency_id, rows, [None] * columns.count)
+        found = linear_references(connection, self.caller.agency_id, rows, measures)
         for k, reference in enumerate(found):
             if measures[k] is None and reference:
                 measures[k], offsets[k] = reference["measure_m"], reference["offset_m"]

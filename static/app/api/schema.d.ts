@@ -11375,6 +11375,7 @@ export interface operations {
                 limit?: number;
                 max_offset_m?: number | null;
                 min_offset_m?: number | null;
+                section?: number | null;
                 to_m?: number | null;
             };
             header?: never;

@@ -48,19 +48,6 @@ export function chainageNear(lane, lon_deg, lat_deg) {
   return best;
 }
 
-/** The chainage of a station; where a station repeats, the first one. @param {Way} way @param {number} station_m */
-export function chainageOf(way, station_m) {
-  const { chainage_m: at, station_m: stations } = way;
-  for (let k = 1; k < at.length; k += 1) {
-    const [a = 0, b = 0] = [stations[k - 1], stations[k]];
-    if ((a <= station_m && station_m <= b) || (b <= station_m && station_m <= a)) {
-      const share = a === b ? 0 : (station_m - a) / (b - a);
-      return (at[k - 1] ?? 0) + share * ((at[k] ?? 0) - (at[k - 1] ?? 0));
-    }
-  }
-  return null;
-}
-
 /** A station as drawings write it, e.g. 1+234.56. @param {number} station_m @param {number} [digits] */
 export function stationText(station_m, digits = 2) {
   const factor = 10 ** digits;
@@ -71,8 +58,15 @@ export function stationText(station_m, digits = 2) {
   return language.value === "de" ? text.replace(".", ",") : text;
 }
 
+/** The metres of a number, or of a station as drawings write it; NaN of other text. @param {string} typed */
+export function stationValue(typed) {
+  const [, sign, kilometre, rest] = /^\s*([+-]?)(\d{1,6})\+(\d{1,3}(?:[.,]\d+)?)\s*$/.exec(typed) ?? [];
+  if (kilometre === undefined || rest === undefined) return typed.trim() ? Number(typed.replace(",", ".")) : NaN;
+  return (sign === "-" ? -1 : 1) * (1000 * Number(kilometre) + Number(rest.replace(",", ".")));
+}
+
 /**
- * Stations with a label, and where they are.
+ * Stations with a label, and where they are: twice where stations repeat, none where they are left out.
  *
  * @param {Way} way
  * @param {number} from_m
@@ -84,12 +78,19 @@ export function stationTicks(way, from_m, to_m, count) {
   const wanted = Math.max((to_m - from_m) / Math.max(count, 1), 1e-3);
   const power = 10 ** Math.floor(Math.log10(wanted));
   const step = [1, 2, 5, 10].map((times) => times * power).find((value) => value >= wanted) ?? 10 * power;
-  const [first, last] = [valueAt(way.chainage_m, way.station_m, from_m), valueAt(way.chainage_m, way.station_m, to_m)];
-  const [low, high] = [Math.min(first, last), Math.max(first, last)];
+  /** @type {{ at_m: number, text: string }[]} */
   const ticks = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 && ticks.length < 200; k += 1) {
-    const at_m = chainageOf(way, k * step);
-    if (at_m !== null && at_m >= from_m - 1e-6 && at_m <= to_m + 1e-6) ticks.push({ at_m, text: stationText(k * step, step < 1 ? 1 : 0) });
+  for (let k = 1; k < way.chainage_m.length && ticks.length < 200; k += 1) {
+    const [start = 0, end = 0] = [way.chainage_m[k - 1], way.chainage_m[k]];
+    const [first = 0, last = 0] = [way.station_m[k - 1], way.station_m[k]];
+    const rise = (last - first) / (end - start);
+    if (end < from_m || start > to_m || !(Math.abs(rise) > 0.4 && Math.abs(rise) < 2.5)) continue; // stations jump here
+    const high = Math.max(first, last);
+    for (let n = Math.ceil(Math.min(first, last) / step - 1e-9); n * step <= high + 1e-9; n += 1) {
+      const at_m = start + (n * step - first) / rise;
+      const isNew = !ticks.length || at_m - (ticks[ticks.length - 1]?.at_m ?? 0) > 1e-6;
+      if (isNew && at_m >= from_m - 1e-6 && at_m <= to_m + 1e-6) ticks.push({ at_m, text: stationText(n * step, step < 1 ? 1 : 0) });
+    }
   }
-  return ticks;
+  return ticks.sort((a, b) => a.at_m - b.at_m);
 }

@@ -8,8 +8,9 @@ import { api, page } from "../api/client.js";
 import { FamilyName, StatusBadge } from "../components/badges.js";
 import { Empty, isAborted } from "../components/load.js";
 import { ProblemBox } from "../components/problem.js";
+import { stationText } from "../components/strip_scale.js";
 import { Table } from "../components/table.js";
-import { codeOf, degrees, number, text, time } from "../format.js";
+import { codeOf, degrees, MISSING, number, text, time } from "../format.js";
 import { distance_m } from "../map/draw.js";
 import { navigate, query, setQuery, withQuery } from "../router.js";
 import { may } from "../session.js";
@@ -178,7 +179,7 @@ function columnsOf() {
     { name: "family", title: t("field.family"), order: (row) => row.family, cell: (row) => html`<${FamilyName} family=${row.family} />` },
     { name: "status", title: t("field.status"), order: (row) => row.status, cell: (row) => html`<${StatusBadge} status=${row.status} family=${row.family} />` },
     { name: "road", title: t("field.road"), order: (row) => row.road, cell: (row) => text(row.road) },
-    { name: "measure", title: t("field.measure_m"), number: true, order: (row) => row.measure_m, cell: (row) => number(row.measure_m, 2) },
+    { name: "measure", title: t("roads.measure"), number: true, order: (row) => row.measure_m, cell: (row) => (row.measure_m === null ? MISSING : stationText(row.measure_m)) },
     { name: "grade", title: t("field.grade"), order: (row) => ["cm", "dm", "m", "unfit"].indexOf(row.position.localization_grade), cell: (row) => t(`grade.${row.position.localization_grade}`) },
     { name: "lon", title: t("field.lon_deg"), number: true, hidden: true, order: (row) => row.position.lon_deg, cell: (row) => degrees(row.position.lon_deg) },
     { name: "lat", title: t("field.lat_deg"), number: true, hidden: true, order: (row) => row.position.lat_deg, cell: (row) => degrees(row.position.lat_deg) },

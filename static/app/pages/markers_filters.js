@@ -3,8 +3,9 @@
 import { html } from "htm/preact";
 import { useEffect, useId, useRef, useState } from "preact/hooks";
 
+import { stationValue } from "../components/strip_scale.js";
 import { FAMILIES, STATUSES } from "../map/symbols.js";
-import { setQuery } from "../router.js";
+import { query, setQuery } from "../router.js";
 import { t, textOr } from "../texts/index.js";
 
 /**
@@ -26,7 +27,7 @@ export function readFilters(parameters) {
   const found = {};
   for (const name of NAMES) {
     const value = parameters.get(name);
-    if (value) found[name] = name === "from_m" || name === "to_m" ? Number(value) : value;
+    if (value) found[name] = name === "from_m" || name === "to_m" ? stationValue(value) : value;
   }
   return found;
 }
@@ -47,8 +48,8 @@ export function Filters({ filters }) {
       <details class="choice" open=${more}>
         <summary>${t("filter.more")}</summary>
         <div class="choice-list">
-          <${TypedFilter} name="from_m" label=${t("filter.from_m")} value=${filters.from_m} numeric disabled=${!filters.road} />
-          <${TypedFilter} name="to_m" label=${t("filter.to_m")} value=${filters.to_m} numeric disabled=${!filters.road} />
+          <${TypedFilter} name="from_m" label=${t("filter.from_m")} value=${query.value.get("from_m") ?? undefined} station placeholder="12+345" disabled=${!filters.road} />
+          <${TypedFilter} name="to_m" label=${t("filter.to_m")} value=${query.value.get("to_m") ?? undefined} station placeholder="12+400" disabled=${!filters.road} />
           ${!filters.road && html`<p class="hint">${t("filter.measure_needs_road")}</p>`}
           <${TypedFilter} name="bbox" label=${t("filter.bbox")} value=${filters.bbox} placeholder="114.17,22.30,114.18,22.31" />
           ${filters.polygon && html`<p>${t("filter.polygon")} <button type="button" class="quiet" onClick=${() => setQuery({ polygon: null })}>${t("action.remove")}</button></p>`}
@@ -59,17 +60,17 @@ export function Filters({ filters }) {
   `;
 }
 
-/** @param {{ name: string, label: string, value?: string | number, numeric?: boolean, disabled?: boolean, placeholder?: string }} props */
-function TypedFilter({ name, label, value, numeric, disabled, placeholder }) {
+/** @param {{ name: string, label: string, value?: string | number, station?: boolean, disabled?: boolean, placeholder?: string }} props */
+function TypedFilter({ name, label, value, station, disabled, placeholder }) {
   const id = useId();
   const [typed, setTyped] = useState(String(value ?? ""));
   const timer = useRef(0);
   useEffect(() => setTyped(String(value ?? "")), [value]);
-  const wrong = Boolean(numeric && typed && !Number.isFinite(Number(typed)));
+  const wrong = Boolean(station && typed && !Number.isFinite(stationValue(typed)));
   const type = (/** @type {string} */ next) => {
     setTyped(next);
     clearTimeout(timer.current);
-    if (numeric && next && !Number.isFinite(Number(next))) return;
+    if (station && next && !Number.isFinite(stationValue(next))) return;
     timer.current = window.setTimeout(() => {
       /** @type {Record<string, string | null>} */
       const changes = { [name]: next.trim() || null };
@@ -80,7 +81,7 @@ function TypedFilter({ name, label, value, numeric, disabled, placeholder }) {
   return html`
     <div class="filter">
       <label for=${id}>${label}</label>
-      <input id=${id} name=${name} value=${typed} disabled=${disabled} placeholder=${placeholder} inputmode=${numeric ? "decimal" : undefined} spellcheck=${false} autocomplete="off"
+      <input id=${id} name=${name} value=${typed} disabled=${disabled} placeholder=${placeholder} spellcheck=${false} autocomplete="off"
         aria-invalid=${wrong ? "true" : undefined} onInput=${(/** @type {any} */ event) => type(event.currentTarget.value)} />
     </div>
   `;

@@ -11,6 +11,7 @@ import { bodyOf, FormFrame, loadSchema, SchemaField, TextField, useForm } from "
 import { Empty, Shown, useLoad } from "../components/load.js";
 import { notify } from "../components/notices.js";
 import { Panel, Section } from "../components/panel.js";
+import { stationText } from "../components/strip_scale.js";
 import { codeOf, degrees, number, time } from "../format.js";
 import { may } from "../session.js";
 import { t, textOr } from "../texts/index.js";
@@ -60,7 +61,7 @@ function factsOf(marker) {
   return [
     ...factsOfFamily(marker),
     [t("field.road"), marker.road],
-    [t("field.measure_m"), marker.measure_m === null ? null : number(marker.measure_m, 2)],
+    [t("roads.measure"), marker.measure_m === null ? null : stationText(marker.measure_m)],
     [t("field.offset_m"), marker.offset_m === null ? null : number(marker.offset_m, 2)],
     [t("field.heading_deg"), marker.heading_deg === null ? null : number(marker.heading_deg, 2)],
     [t("field.position"), `${degrees(marker.position.lon_deg)}, ${degrees(marker.position.lat_deg)}`],

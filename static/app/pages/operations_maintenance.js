@@ -13,7 +13,8 @@ import { attempt, notify } from "../components/notices.js";
 import { addressOf, usePages } from "../components/pages.js";
 import { Panel } from "../components/panel.js";
 import { Picture } from "../components/picture.js";
-import { degrees, number, text, time } from "../format.js";
+import { stationText } from "../components/strip_scale.js";
+import { degrees, MISSING, number, text, time } from "../format.js";
 import { may } from "../session.js";
 import { t, textOr } from "../texts/index.js";
 
@@ -55,7 +56,7 @@ const columns = () => [
   { name: "priority", title: t("field.priority"), order: (row) => -row.priority, cell: (row) => html`<${Priority} of=${row.priority} />` },
   { name: "code", title: t("field.code"), order: (row) => row.code, cell: (row) => (row.marker_id ? html`<a class="code" href=${`/markers/${row.marker_id}`}>${text(row.code)}</a>` : text(row.code)) },
   { name: "road", title: t("field.road"), order: (row) => row.road, cell: (row) => text(row.road) },
-  { name: "measure", title: t("field.measure_m"), number: true, order: (row) => row.measure_m, cell: (row) => number(row.measure_m, 1) },
+  { name: "measure", title: t("roads.measure"), number: true, order: (row) => row.measure_m, cell: (row) => (row.measure_m === null ? MISSING : stationText(row.measure_m, 1)) },
   { name: "vehicles", title: t("maintenance.vehicles"), number: true, order: (row) => row.vehicles, cell: (row) => number(row.vehicles) },
   { name: "last", title: t("field.last_at"), order: (row) => row.last_at, cell: (row) => time(row.last_at) },
   { name: "status", title: t("field.status"), order: (row) => row.status, cell: (row) => textOr(`option.${row.status}`, row.status) },
@@ -85,7 +86,7 @@ function One({ id, onChanged }) {
         <${Facts} of=${[
           [t("field.code"), item.code && html`<span class="code">${item.code}</span>`],
           [t("field.family"), textOr(`family.${item.family}`, item.family)],
-          [t("field.road"), item.road && `${item.road}${item.measure_m === null ? "" : `, ${number(item.measure_m, 1, "m")}`}`],
+          [t("field.road"), item.road && `${item.road}${item.measure_m === null ? "" : `, ${stationText(item.measure_m, 1)}`}`],
           [t("field.position"), `${degrees(item.lon_deg)}, ${degrees(item.lat_deg)}`],
           [t("maintenance.first_at"), time(item.first_at)],
           [t("field.last_at"), time(item.last_at)],

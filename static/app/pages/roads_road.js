@@ -9,7 +9,7 @@ import { Empty, Shown, useLoad } from "../components/load.js";
 import { notify } from "../components/notices.js";
 import { RoadMap } from "../components/road_map.js";
 import { Strip } from "../components/strip.js";
-import { stationText } from "../components/strip_scale.js";
+import { chainageNear, stationText } from "../components/strip_scale.js";
 import { codeOf, number, text, time } from "../format.js";
 import { navigate, query, setQuery } from "../router.js";
 import { may } from "../session.js";
@@ -58,20 +58,69 @@ async function stationPlaces(road, signal) {
   return items.flatMap(({ places }, k) => places.map((place) => ({ ...place, measure_m: references[k]?.measure_m ?? 0 })));
 }
 
+/** Sections of a road with their chainages: they follow each other along the axis. @param {any} road */
+function sectionsOf(road) {
+  let start_m = 0;
+  return road.sections.map((/** @type {{ from_m: number, to_m: number, length_m: number }} */ { from_m, to_m, length_m }) => {
+    const section = { from_m, to_m, start_m, end_m: start_m + length_m };
+    start_m = section.end_m;
+    return section;
+  });
+}
+
+/** @typedef {{ from_m: number, to_m: number, start_m: number, end_m: number }} Section */
+
+/** The axis of a road as a strip takes it: its measures jump between sections. @param {any} road @param {Section[]} sections */
+function wayOf(road, sections) {
+  /** @type {number[][]} */
+  const points = road.geometry.type === "MultiLineString" ? road.geometry.coordinates.flat() : road.geometry.coordinates;
+  return {
+    name: road.name, length_m: road.length_m,
+    chainage_m: sections.flatMap(({ start_m, end_m }) => [start_m, end_m]), station_m: sections.flatMap(({ from_m, to_m }) => [from_m, to_m]),
+    lon_deg: points.map(([lon = 0]) => lon), lat_deg: points.map(([, lat = 0]) => lat),
+  };
+}
+
+/**
+ * Where a marker is along the axis, by its measure; of several places with this measure the one nearest to its position.
+ *
+ * @param {ReturnType<typeof wayOf>} way @param {Section[]} sections @param {any} marker
+ */
+function placeOf(way, sections, marker) {
+  const places = sections.filter(({ from_m, to_m }) => marker.measure_m >= from_m - 0.01 && marker.measure_m <= to_m + 0.01)
+    .map(({ from_m, to_m, start_m, end_m }) => start_m + ((marker.measure_m - from_m) / (to_m - from_m || 1)) * (end_m - start_m));
+  if (places.length === 1) return places[0] ?? 0;
+  const along_m = lengthsAlong(way);
+  const total_m = along_m[along_m.length - 1] || 1;
+  const near_m = (chainageNear({ ...way, chainage_m: along_m }, marker.position.lon_deg, marker.position.lat_deg) / total_m) * way.length_m;
+  return places.length ? places.reduce((best, at_m) => (Math.abs(at_m - near_m) < Math.abs(best - near_m) ? at_m : best)) : near_m;
+}
+
+/** Distances along the vertices of an axis, on a sphere: to choose between places, not to measure. @param {{ lon_deg: number[], lat_deg: number[] }} way */
+function lengthsAlong({ lon_deg, lat_deg }) {
+  const along = [0];
+  for (let k = 1; k < lon_deg.length; k += 1) {
+    const east = ((lon_deg[k] ?? 0) - (lon_deg[k - 1] ?? 0)) * Math.cos(((lat_deg[k] ?? 0) * Math.PI) / 180);
+    along.push((along[k - 1] ?? 0) + Math.hypot(east, (lat_deg[k] ?? 0) - (lat_deg[k - 1] ?? 0)) * 111195);
+  }
+  return along;
+}
+
 /** @param {{ road: any, markers: any[], ticks: any[], alignments: any[], onChanged: () => void }} props */
 function Road({ road, markers, ticks, alignments, onChanged }) {
   const editing = query.value.get("edit") === "axis";
   const [pointed, setPointed] = useState(/** @type {any} */ (null));
+  const sections = useMemo(() => sectionsOf(road), [road]);
+  const way = useMemo(() => wayOf(road, sections), [road]);
   const placed = useMemo(() => markers.filter(({ measure_m }) => measure_m !== null).map((marker) => ({
-    id: `m${marker.id}`, marker, row: `family ${marker.family}`, at_m: marker.measure_m - road.from_m, family: marker.family, status: marker.status,
+    id: `m${marker.id}`, marker, row: `family ${marker.family}`, at_m: placeOf(way, sections, marker), family: marker.family, status: marker.status,
     label: `${textOr(`family.${marker.family}`, marker.family)} ${codeOf(marker)}, ${textOr(`status.${marker.status}`, marker.status)}`,
   })), [markers]);
-  const points = useMemo(() => road.calibration.map((/** @type {any} */ point, /** @type {number} */ k) => ({ id: `k${k}`, row: "calibration", at_m: Math.max(0, point.measure_m - road.from_m), sign: "K", kind: "event", label: t("roads.calibrated", { measure: stationText(point.measure_m, 3) }) })), [road]);
+  const points = useMemo(() => road.calibration.map((/** @type {any} */ point, /** @type {number} */ k) => ({ id: `k${k}`, row: "calibration", at_m: point.chainage_m, sign: "K", kind: "event", label: t("roads.calibrated", { measure: stationText(point.measure_m, 3) }) })), [road]);
   const spots = useMemo(() => [
     ...placed.map(({ id, marker, label }) => ({ id, kind: /** @type {const} */ ("marker"), family: marker.family, status: marker.status, label, lon_deg: marker.position.lon_deg, lat_deg: marker.position.lat_deg })),
     ...ticks.map((tick, k) => ({ id: `t${k}`, kind: /** @type {const} */ ("station"), sign: stationText(tick.measure_m, 0), label: stationText(tick.measure_m, 0), lon_deg: tick.lon_deg, lat_deg: tick.lat_deg })),
   ], [placed, ticks]);
-  const way = useMemo(() => ({ name: road.name, length_m: road.to_m - road.from_m, chainage_m: [0, road.to_m - road.from_m], station_m: [road.from_m, road.to_m] }), [road]);
   const lines = useMemo(() => [{ name: road.name, line: road.geometry.coordinates }], [road]);
   const spot = pointed?.id ? spots.find(({ id }) => id === pointed.id) : null;
   const open = (/** @type {string} */ id) => id.startsWith("m") && navigate(`/markers/${id.slice(1)}`);

@@ -65,7 +65,7 @@ def test_what_is_released_is_shown_and_nothing_else(owner: httpx.Client, anybody
     marker = new_marker(owner, place())
     shown = {
         "code": marker["code"]["digits"], "agency": "Straßenbau <Süd>", "status": "in use", "revision": ">1<",
-        "road": "A 5", "measure": "12345.6 m",
+        "road": "A 5", "measure": "km 12.346",
     }  # fmt: skip
     for released in (EVERYTHING, *([name] for name in EVERYTHING)):
         release(owner, released)
@@ -146,7 +146,7 @@ def test_both_languages(
     answer = anybody.get(f"/m/{marker['id']}{query}", headers=headers)
     assert answer.headers["content-language"] == language
     assert f'<html lang="{language}">' in answer.text
-    expected = {"en": ("Report damage", "in use", "12345.6 m"), "de": ("Schaden melden", "in Betrieb", "12345,6 m")}
+    expected = {"en": ("Report damage", "in use", "km 12.346"), "de": ("Schaden melden", "in Betrieb", "km 12,346")}
     assert all(text in answer.text for text in expected[language])
     (switch,) = [a for tag, a in Tags(answer.text).tags if tag == "a" and "hreflang" in a]
     other = anybody.get(httpx.URL(str(answer.url)).join(str(switch["href"])), headers=headers)

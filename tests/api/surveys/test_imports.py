@@ -441,6 +441,26 @@ def test_rows_on_a_registered_road_get_its_measures_and_keep_them_right_when_the
     assert measures() == pytest.approx([m + length_m / 1000 for m in expected], abs=1e-3)
 
 
+def test_stations_of_a_survey_are_compared_with_the_registered_road(client: httpx.Client) -> None:
+    """At 1 km stations go on from 12+300 after 12+600: 12+400 is twice on the road, and both are right."""
+    line = {"type": "LineString", "coordinates": [[LON, LAT], [LON + 0.02, LAT]]}
+    points = [{"measure_m": 11_600, "vertex": 0}, {"measure_m": 12_600, "ahead_m": 12_300, "chainage_m": 1000}]
+    road = client.post("/v1/roads", json={"name": "K 2", "geometry": line, "calibration": points}).json()
+    references = [{"measure_m": measure_m, "offset_m": 0.0} for measure_m in (11_700, 12_400)]
+    placed = client.post(f"/v1/roads/{road['id']}/position", json={"references": references}).json()["items"]
+    (first,), (before, after) = (item["places"] for item in placed)
+    spots = [(first, "11+700.00"), (before, "12+400.00"), (after, "12+400.02"), (after, "11+700.00")]
+    lines = [f"{k},{p['lon_deg']:.9f},{p['lat_deg'] + k * 1e-5:.9f},{s}" for k, (p, s) in enumerate(spots, 1)]
+    data = "\n".join(["number,lon,lat,station", *lines]).encode()
+    report = _send(client, data, {**DEGREES, "road": "K 2"}).json()
+    (fault,) = [fault for fault in report["faults"] if fault["code"] == "measure_disagrees"]
+    assert (fault["row"], fault["severity"]) == (4, "warning")
+    assert "the measure is 11+700.00, the position lies at 12+400.00" in fault["message"]
+    listed = client.get(f"/v1/roads/{road['id']}/markers").json()["items"]
+    assert [m["measure_m"] for m in listed] == [11_700.0, 11_700.0, 12_400.0, 12_400.02]
+    assert [m["code"]["number"] for m in listed[2:]] == [2, 3]
+
+
 def test_rows_that_are_left_out_are_neither_checked_nor_stored(client: httpx.Client) -> None:
     data = _csv(row3="3,8.4,abc", row5="2,8.417,49.0052")
     dry = _send(client, data, {**DEGREES, "dry_run": True, "list_rows": 100}).json()

@@ -183,6 +183,24 @@ def test_heights_end_with_the_profile() -> None:
     assert centre(read_landxml(flat))[:, 2] == pytest.approx(100.0), "heights are in the unit of the file"
 
 
+def test_stations_that_fall_along_the_line() -> None:
+    extra = (
+        '<StaEquation staBack="100" staAhead="900" staInternal="100" staIncrement="decreasing"/>'
+        '<StaEquation staBack="850" staAhead="2000" staIncrement="increasing"/>'
+    )
+    stationing = read_landxml(landxml(FLAT, extra=extra)).stationing["CL"]
+    assert [stationing.displayed_m(at) for at in (0, 99, 100, 120, 150, 160)] == [0, 99, 900, 880, 2000, 2010]
+
+
+def test_each_alignment_has_its_own_stations() -> None:
+    other = f'</Alignment><Alignment name="Ramp" staStart="5000"><CoordGeom>{line((0, 9), (90, 9))}</CoordGeom>'
+    other += '<StaEquation staInternal="5040" staAhead="7000"/>'
+    file = read_landxml(landxml(FLAT, extra=other, sta=100.0))
+    assert file.warnings == ()
+    shown = {name: [one.displayed_m(at) for at in (0.0, 50.0)] for name, one in file.stationing.items()}
+    assert shown == {"CL": [100, 150], "Ramp": [5000, 7010]}
+
+
 @pytest.mark.parametrize(
     ("units", "height"),
     [
@@ -221,15 +239,16 @@ def test_station_equations() -> None:
         '<StaEquation staBack="305.41" staAhead="1000"/><StaEquation staAhead="5000" staInternal="27405.41"/>'
     )
     file = read_landxml(landxml(line((0, 0), (1000, 0)), extra=extra, units=feet, sta=27000))
-    assert file.start_station_m == pytest.approx(27000 * US_FOOT_M)
+    stationing = file.stationing["CL"]
+    assert stationing.start_m == pytest.approx(27000 * US_FOOT_M)
     expected = [(205.41, 27205.41, 205.41), (305.41, 305.41, 1000.0), (405.41, 1100.0, 5000.0)]
-    for equation, values in zip(file.station_equations, expected, strict=True):
+    for equation, values in zip(stationing.equations, expected, strict=True):
         assert isinstance(equation, StationEquation)
         found = (equation.distance_m, equation.back_m, equation.ahead_m)
         assert np.array(found) / US_FOOT_M == pytest.approx(values)
     assert stations(file)[-1] == pytest.approx(1000 * US_FOOT_M), "geometry stays in true distance"
     outside = read_landxml(landxml(FLAT, extra='<StaEquation staAhead="1" staInternal="900"/>'))
-    assert outside.station_equations == ()
+    assert outside.stationing["CL"].equations == ()
     assert any("StaEquation 900" in warning for warning in outside.warnings)
 
 
@@ -261,7 +280,7 @@ def test_feet_are_those_of_the_crs_or_declared(
     data = landxml(FLAT, units=f'<Units><Imperial linearUnit="{unit}"/></Units>', head=head, sta=1e6)
     file = read_alignment(data, declaration=declared)
     assert file.unit_m == pytest.approx(metres, rel=1e-12)
-    assert file.start_station_m == pytest.approx(1e6 * metres, rel=1e-12)
+    assert file.stationing["CL"].start_m == pytest.approx(1e6 * metres, rel=1e-12)
     assert [note in warning for warning in file.warnings] == [True] * bool(note)
 
 

@@ -87,7 +87,8 @@ def test_stations_are_the_measures_of_the_road() -> None:
         CalibrationPoint(part=0, chainage_m=900.0, measure_m=1902.0, ahead_m=5000.0),
     ]
     built = read(road(calibration=stations))
-    shown = [built.displayed_station_m(at) for at in (0.0, 100.0, 600.0, 700.0, 900.0, 1000.0)]
+    (stationing,) = built.stationing.values()
+    shown = [stationing.displayed_m(at) for at in (0.0, 100.0, 600.0, 700.0, 900.0, 1000.0)]
     assert shown == pytest.approx([1000.0, 1100.0, 1602.0, 1702.0, 5000.0, 5100.0], abs=1e-6)
 
 

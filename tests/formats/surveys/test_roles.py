@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import shapely
 
@@ -102,6 +103,25 @@ def test_of_two_heights_the_one_above_the_declared_datum_is_read() -> None:
         height = _read(text, vertical_datum=datum).height
         assert height is not None
         assert height[0] == expected
+
+
+@pytest.mark.parametrize("name", ["Station", "measure_m", "Chainage [m]", "km"])
+def test_measures_as_kilometres_and_metres(name: str) -> None:
+    read = _read(_rows(name, "12+345.67", "12+346", "-0+001.5"))
+    assert read.numbers["measure_m"].tolist() == [12345.67, 12346.0, -1.5]
+    assert "point" not in read.texts
+    assert not read.faults.counts
+
+
+def test_what_is_no_measure() -> None:
+    points = _read(_rows("Station", "101", "102", "P7"))
+    assert list(points.texts["point"]) == ["101", "102", "P7"]
+    assert "measure_m" not in points.numbers
+    assert "measure_m" not in _read(_rows("km", "12.3", "12.4")).numbers, "kilometres of a road, or of an odometer"
+    assert _read(_rows("chainage_m", "12.3", "12.4")).numbers["measure_m"].tolist() == [12.3, 12.4]
+    read = _read(_rows("Station", "12+345.67", "123+45.6", "12+346"))
+    assert read.faults.counts == {"station_of_100_ft": 1}
+    assert np.isnan(read.numbers["measure_m"][1])
 
 
 # The X of these systems is the northing; their false origins make both orders lie in their areas of use.

@@ -10,7 +10,7 @@ import orjson
 import pytest
 
 from app.errors import UnreadableUpload
-from app.formats.alignments.geometry import StationEquation
+from app.formats.alignments.geometry import StationEquation, Stationing
 from app.markers.reading import Verdict
 from app.planning.alignment import Alignment, Lane
 from app.planning.outputs.plan_document import read_plan, write_plan
@@ -50,7 +50,7 @@ def changed_plan() -> Plan:
     road = replace(
         plan.alignment,
         lanes=(first, second),
-        station_equations=(StationEquation(100.0, 1100.0, 200.0),),
+        stationing={first.road: Stationing(1000.0, (StationEquation(100.0, 1100.0, 200.0),))},
         realization="ITRF2014",
         epoch=2010.5,
         warnings=("a warning",),
@@ -75,6 +75,21 @@ def test_a_plan_of_an_earlier_release_is_read() -> None:
     older = written.replace(b'_m_s2"', b'_mps2"').replace(b'speed_m_s"', b'speed_mps"')
     assert older != written
     assert write_plan(read_plan(older)) == written
+
+
+def test_stations_of_the_first_format_were_true_distances() -> None:
+    document = orjson.loads(write_plan(full_plan()))
+    document["format"] = "waymark-plan/1"
+    del document["alignment"]["stationing"]
+    equation = {"distance_m": 100.0, "back_m": 5100.0, "ahead_m": 200.0}
+    document["alignment"] |= {"start_station_m": 5000.0, "station_equations": [equation]}
+    read = read_plan(orjson.dumps(document))
+    for marker, written in zip(read.markers, document["markers"], strict=True):
+        at_m = written["station_m"]
+        assert marker.station_m == pytest.approx(5000.0 + at_m if at_m < 100 else 100.0 + at_m)
+        lane = read.alignment.lane(marker.lane)
+        assert read.alignment.stations_at(lane, marker.chainage_m) == pytest.approx([marker.station_m], abs=1e-6)
+    assert_equal(read_plan(write_plan(read)), read)
 
 
 def test_the_document_is_plain_json_with_a_summary() -> None:

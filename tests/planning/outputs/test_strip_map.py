@@ -14,7 +14,7 @@ import pikepdf
 import pytest
 
 from app.errors import InvalidParameter
-from app.formats.alignments.geometry import StationEquation
+from app.formats.alignments.geometry import StationEquation, Stationing
 from app.planning.outputs.drawing_sheet import PAGE_MM, TitleBlock
 from app.planning.outputs.strip_layout import ROW_MM, SCALES, STRIP_MM, Strip, cut_strips
 from app.planning.outputs.strip_map import NOT_SURVEYED, Drawings
@@ -105,7 +105,8 @@ def test_long_roads_get_smaller_scales_and_few_sheets() -> None:
 def test_sheets_are_a3_and_say_what_a_crew_needs(tmp_path: Path) -> None:
     plan = full_plan()
     equation = StationEquation(320.0, 320.0, 1000.0)
-    plan = replace(plan, alignment=replace(plan.alignment, station_equations=(equation,), surveyed=False))
+    stationing = {lane.road: Stationing(0.0, (equation,)) for lane in plan.alignment.lanes}
+    plan = replace(plan, alignment=replace(plan.alignment, stationing=stationing, surveyed=False))
     block = TitleBlock("Road Agency", "RA-77", "2026-11-22", "A. Smith", "B. Jones")
     data = drawn(plan, block=block, scale=500)
     with pikepdf.open(io.BytesIO(data)) as file:
