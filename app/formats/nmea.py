@@ -140,6 +140,13 @@ def read_nmea(text: str, clock: LogClock, day: date | None, report: LogReport) -
     import pynmeagps  # here: only a decoder process reads files
 
     reading = _Reading(report)
+    if "$PUBX,00" in text and not _SENTENCE.search(text):
+        raise InvalidParameter(
+            "the log holds u-blox's own sentences (PUBX) only, which are not read",
+            field="poses",
+            limit=", ".join(_POSITIONS),
+            cure="switch RMC or GGA on in the receiver",
+        )
     sentences = list(_of_one_solution(list(_find_sentences(text, report)), report))
     rmc_times_s = {
         _second_of_day(kind, sentence)

@@ -282,6 +282,13 @@ def read_gpx(source: PoseSource) -> Iterator[PosePoint]:
         raise UnreadableUpload(
             f"{name} is broken: {str(error)[:160]}", field=FIELD, limit="GPX 1.0 or 1.1", cure="export the track again"
         ) from error
+    if not any(segment.points for track in gpx.tracks for segment in track.segments):
+        raise UnreadableUpload(
+            f"{name} has no track, but {len(gpx.routes)} routes and {len(gpx.waypoints)} waypoints",
+            field=FIELD,
+            limit="track points (trkpt) with times",
+            cure="export the recorded track; a route has no times",
+        )
     points = (point for track in gpx.tracks for segment in track.segments for point in segment.points)
     for entry, point in enumerate(points):
         report.entries += 1
@@ -356,6 +363,7 @@ POSE_FORMATS: tuple[Format[PoseReader], ...] = (
 
 
 EXPECTED = list_accepted(POSE_FORMATS)
+_MISFIT_DEG = 30.0  # [deg] above the drift angle of a vehicle, below a quarter turn
 
 
 def read_poses(
@@ -405,6 +413,11 @@ def read_poses(
     if declaration.accuracy_m is not None:
         known = np.isfinite(track.accuracy_m)
         track = replace(track, accuracy_m=np.where(known, track.accuracy_m, declaration.accuracy_m))
+    if (misfit_deg := track.heading_misfit_deg()) > _MISFIT_DEG:
+        report.warn(
+            f"headings and the direction of travel are {misfit_deg:.0f} degrees apart (median): headings are expected "
+            "clockwise from true north in degrees; check their unit, their origin and the antenna's mounting"
+        )
     if declaration.forward_m or declaration.left_m:
         if not np.isfinite(track.heading_deg).any():
             report.warn("there is no heading: positions stay where they were measured, off the vehicle's reference")

@@ -26,6 +26,7 @@ SLOW_SHARE = 0.3  # of a receiver's error that changes along the track like wand
 MAX_SPEED_M_S = 70.0  # [m/s] a faster step is a gap in the track; 252 km/h
 FASTEST_M_S = 150.0
 """A point that can only be reached faster than this, from both sides, is an outlier. [m/s] 540 km/h."""
+_LEAST_STEPS = 5  # by which headings are compared with the direction of travel
 _SLACK_M = 30.0  # [m] jump of a receiver that is no outlier
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
@@ -107,6 +108,15 @@ class PoseTrack:
             lon_deg=(lon_deg + 180.0) % 360.0 - 180.0,
             lat_deg=self.lat_deg + np.degrees(north_m / north_per_rad),
         )
+
+    def heading_misfit_deg(self) -> float:
+        """Median angle between the headings and the direction of travel; NaN where neither can be compared. [deg]"""
+        east_per_rad, north_per_rad = metres_per_radian(np.radians(self.lat_deg[:-1]))
+        east_m = np.radians((np.diff(self.lon_deg) + 180.0) % 360.0 - 180.0) * east_per_rad
+        north_m = np.radians(np.diff(self.lat_deg)) * north_per_rad
+        apart = (self.heading_deg[:-1] - np.degrees(np.arctan2(east_m, north_m)) + 180.0) % 360.0 - 180.0
+        known = np.isfinite(apart) & (np.hypot(east_m, north_m) >= MIN_STEP_M)
+        return float(np.median(np.abs(apart[known]))) if known.sum() >= _LEAST_STEPS else math.nan
 
     def driven_m(self) -> float:
         """Distance that the vehicle drove.

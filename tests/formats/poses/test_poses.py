@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import UTC, date, datetime
 from time import process_time
 
@@ -435,6 +436,22 @@ def test_gpx_times_without_a_zone_are_reported() -> None:
     track, report = read(local, clock=LogClock(utc_offset_s=3600.0))
     assert not report.warnings
     assert track.time_s.tolist() == [AT_S - 3600]
+
+
+@pytest.mark.parametrize(("scale", "shift", "warned"), [(1.0, 0.0, False), (1.0, 20.0, False), (1.0, 90.0, True),
+                                                        (math.pi / 180, 0.0, True)])  # fmt: skip
+def test_headings_that_do_not_fit_the_travel_are_reported(scale: float, shift: float, warned: bool) -> None:
+    rows = [f"2026-03-16T13:39:{k:02d}Z,{8 + k * 1e-4},{49 + k * 1e-4},{(33.3 + shift) * scale:.4f}" for k in range(9)]
+    report = read("\n".join(["time,lon,lat,heading", *rows]))[1]
+    assert any("headings and the direction of travel" in warning for warning in report.warnings) == warned
+
+
+def test_what_holds_no_track_is_named() -> None:
+    route = GPX.replace("<trk><trkseg>{}</trkseg></trk>", '<rte><rtept lat="49" lon="8"/></rte>')
+    with pytest.raises(UnreadableUpload, match="no track, but 1 routes and 0 waypoints"):
+        read(route)
+    with pytest.raises(InvalidParameter, match="PUBX"):
+        read(nmea("PUBX,00,133932.00,4217.00740,N,08536.74074,W,205.3,G3,2.1,3.4,0.1,77.5,0.0,,1.2,1.5,1.1,9,0,0"))
 
 
 def test_a_datum_in_the_log_is_refused() -> None:
