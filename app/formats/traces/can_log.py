@@ -121,7 +121,8 @@ def read_can_log(
     frames = _read_frames(part, [signal for signal, _ in placed.values()], limits, report)
     series = {}
     for name, (signal, decode) in placed.items():
-        kind = _choose_kind(part.name, frames, signal, declaration.channel, f"can.{name}", report)
+        channel = declaration.channel if signal.channel is None else signal.channel
+        kind = _choose_kind(part.name, frames, signal, channel, f"can.{name}", report)
         group = frames[kind]
         value = _extract(group.data, signal) if decode is None else _decode(group.data, decode)
         t, value = _valid(np.array(group.t_s), value, signal, part.name, name, report)

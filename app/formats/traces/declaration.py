@@ -96,6 +96,7 @@ class CanSignal(Declaration):
     unit: Name | None = Field(None, description="Of the speed or heading; that of the DBC if left out.")
     minimum: Number | None = Field(None, description="Smaller values mean that there is none.")
     maximum: Number | None = Field(None, description="Larger values mean that there is none.")
+    channel: Name | Whole | None = Field(None, description="Of this signal, where it is another than `can.channel`.")
 
     @model_validator(mode="after")
     def _is_placed(self) -> CanSignal:

@@ -2855,6 +2855,8 @@ export interface components {
              */
             byte_order?: "little" | "big";
             /** @default null */
+            channel?: string | number | null;
+            /** @default null */
             extended?: boolean | null;
             /** @default 1 */
             factor?: number;

@@ -239,6 +239,8 @@ def test_channels_are_those_of_the_file(
     assert shown.field == "can.channel"
     assert str(declared_channel) in str(shown.limit)
     assert "several channels" in refused_log(content, f"drive.{suffix}").message
+    own = SIGNAL.model_copy(update={"channel": declared_channel})
+    assert set(read_km_h(content, f"drive.{suffix}", signal=own, channel="9")[0]) == {50.0}, "of the signal itself"
 
 
 def test_a_log_without_channels_has_none_to_declare(tmp_path: Path) -> None:
