@@ -55,7 +55,16 @@ async function stationPlaces(road, signal) {
   for (let k = Math.ceil(road.from_m / step); k * step <= road.to_m; k += 1) references.push({ measure_m: k * step, offset_m: 0 });
   if (!references.length) return [];
   const { items } = await ok(api.POST("/v1/roads/{road_id}/position", { params: { path: { road_id: road.id } }, body: { references }, signal }));
-  return items.flatMap(({ places }, k) => places.map((place) => ({ ...place, measure_m: references[k]?.measure_m ?? 0 })));
+  const found = items.flatMap(({ places }, k) => places.map((place) => ({ ...place, sign: stationText(references[k]?.measure_m ?? 0, 0) })));
+  found.sort((a, b) => a.section - b.section || a.chainage_m - b.chainage_m);
+  /** @type {typeof found} */
+  const places = [];
+  for (const place of found) {
+    const last = places[places.length - 1];
+    if (last && Math.abs(last.chainage_m - place.chainage_m) < 0.01) last.sign += ` = ${place.sign}`; // an equation of stationing
+    else places.push(place);
+  }
+  return places;
 }
 
 /** Sections of a road with their chainages: they follow each other along the axis. @param {any} road */
@@ -119,7 +128,7 @@ function Road({ road, markers, ticks, alignments, onChanged }) {
   const points = useMemo(() => road.calibration.map((/** @type {any} */ point, /** @type {number} */ k) => ({ id: `k${k}`, row: "calibration", at_m: point.chainage_m, sign: "K", kind: "event", label: t("roads.calibrated", { measure: stationText(point.measure_m, 3) }) })), [road]);
   const spots = useMemo(() => [
     ...placed.map(({ id, marker, label }) => ({ id, kind: /** @type {const} */ ("marker"), family: marker.family, status: marker.status, label, lon_deg: marker.position.lon_deg, lat_deg: marker.position.lat_deg })),
-    ...ticks.map((tick, k) => ({ id: `t${k}`, kind: /** @type {const} */ ("station"), sign: stationText(tick.measure_m, 0), label: stationText(tick.measure_m, 0), lon_deg: tick.lon_deg, lat_deg: tick.lat_deg })),
+    ...ticks.map((tick, k) => ({ id: `t${k}`, kind: /** @type {const} */ ("station"), sign: tick.sign, label: tick.sign, lon_deg: tick.lon_deg, lat_deg: tick.lat_deg })),
   ], [placed, ticks]);
   const lines = useMemo(() => [{ name: road.name, line: road.geometry.coordinates }], [road]);
   const spot = pointed?.id ? spots.find(({ id }) => id === pointed.id) : null;
