@@ -333,7 +333,8 @@ def _receiver(
         east_m2, north_m2 = (round(float(value), 4) for value in rng.uniform(0.01, 9, 2))
         covariance = np.array([east_m2, 0.1, 0, 0.1, north_m2, 0, 0, 0, 20.0])
         status = messages.make("sensor_msgs/msg/NavSatStatus", int(pick(rng, 0, 1, 2)) if is_fix else -1, 1)
-        position = (float(lat_deg[k]), 114.2, 5.0) if is_fix else pick(rng, (math.nan,) * 3, (0.0,) * 3)
+        nowhere: tuple[float, float, float] = pick(rng, (math.nan,) * 3, (0.0,) * 3)
+        position = (float(lat_deg[k]), 114.2, 5.0) if is_fix else nowhere
         fix = messages.make(
             "sensor_msgs/msg/NavSatFix", messages.header(int(at_ns[k]) if has_stamps else 0), status, *position, covariance,
             kind,

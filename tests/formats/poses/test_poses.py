@@ -236,7 +236,7 @@ def test_headings_and_accuracies() -> None:
     )  # fmt: skip
     assert (track.time_s - AT_S).tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(track.heading_deg, [91.5, 80.0, np.nan, 359.0])
-    assert track.accuracy_m[0] == pytest.approx(np.hypot(0.03, 0.04) / np.sqrt(2))
+    assert track.accuracy_m[0] == pytest.approx(0.05)  # of both axes, as of the covariance in a bag
 
 
 def headed(*order: str, headings: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0)) -> list[str]:
@@ -537,3 +537,11 @@ def test_the_first_or_last_cell_between_tabs_may_be_empty() -> None:
     track, report = read(text)
     assert (track.time_s - AT_S).tolist() == [0, 1]
     assert not report.left_out_count
+
+
+def test_a_declared_date_is_that_of_the_first_position() -> None:
+    lost = gga("235959.00", 0)
+    track, _report = read(nmea(lost, gga("000000.00"), gga("000001.00")), date=date(2026, 3, 17))
+    assert track.time_s[0] == datetime(2026, 3, 17, tzinfo=UTC).timestamp()
+    track, _report = read(nmea(gga("235958.00"), lost, gga("000000.00")), date=date(2026, 3, 16))
+    assert track.time_s[-1] == datetime(2026, 3, 17, tzinfo=UTC).timestamp()
