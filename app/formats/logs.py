@@ -184,7 +184,7 @@ class LogClock(Declaration):
             seconds = self._from_number(value)
         elif isinstance(value, str) and len(value) <= _MAX_TEXT:
             text = value.strip()
-            seconds = self._from_number(float(text)) if _NUMBER.match(text) else self._from_text(text)
+            seconds = self._from_number(float(text)) if _NUMBER.match(text) else self.from_text(text)
         else:
             return NOWHEN
         seconds += self.offset_s
@@ -205,7 +205,8 @@ class LogClock(Declaration):
         seconds = value * _SCALE_S[scale]
         return utc_from_gps_s(seconds) if scale in (TimeScale.GPS_S, TimeScale.GPS_MS) else seconds
 
-    def _from_text(self, text: str) -> float:
+    def from_text(self, text: str) -> float:
+        """Seconds since 1970-01-01 UTC of a text that is no number, of any year; NaN where it is no time. [s]"""
         if len(text) < 10:
             return NOWHEN
         if text[-1] == "z":  # RFC 3339, section 5.6

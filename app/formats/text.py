@@ -486,6 +486,8 @@ def _parse_block(block: bytes, width: int, dialect: Dialect) -> Floats | None:
     if block.count(delimiter) != count * (width - 1) or block.translate(None, _NUMERIC + b"," + delimiter):
         return None
     if dialect.decimal == ",":
+        if b"." in block:  # perhaps between thousands
+            return None
         block = block.replace(b",", b".")
     empty_cells = (delimiter * 2, delimiter + b"\n", delimiter + b"\r", b"\n" + delimiter)
     if any(empty in b"\n" + block for empty in empty_cells) or not _rows_have(block, delimiter, width):

@@ -119,7 +119,7 @@ def _write_mcap(rng: Rng, form: _Form, messages: _Messages, sent: list[_Sent]) -
 
     has_summary = not chance(rng, 0.1)
     out = io.BytesIO()
-    writer = Writer(
+    writer: Any = Writer(
         out, chunk_size=int(pick(rng, 500, 4096, 1 << 20)), compression=pick(rng, *CompressionType),
         use_chunking=chance(rng, 0.7),
         index_types=pick(rng, IndexType.ALL, IndexType.ALL, IndexType.CHUNK, IndexType.NONE),
@@ -336,8 +336,8 @@ def _receiver(
         nowhere: tuple[float, float, float] = pick(rng, (math.nan,) * 3, (0.0,) * 3)
         position = (float(lat_deg[k]), 114.2, 5.0) if is_fix else nowhere
         fix = messages.make(
-            "sensor_msgs/msg/NavSatFix", messages.header(int(at_ns[k]) if has_stamps else 0), status, *position, covariance,
-            kind,
+            "sensor_msgs/msg/NavSatFix", messages.header(int(at_ns[k]) if has_stamps else 0), status, *position,
+            covariance, kind,
         )  # fmt: skip
         sent.append(_Sent(topic, "sensor_msgs/msg/NavSatFix", int(recorded_ns[k]), fix))
         if is_fix:

@@ -42,8 +42,8 @@ def _encoded(codec: str, between: int, group: int) -> _Stream:
     import av
 
     out = io.BytesIO()
-    with av.open(out, "w", format="matroska") as container:
-        stream: Any = container.add_stream(codec, rate=10)
+    with av.open(out, "w", format="matroska") as target:
+        stream: Any = target.add_stream(codec, rate=10)
         stream.codec_context.max_b_frames, stream.codec_context.gop_size = between, group
         stream.width, stream.height = _SIZE_PX
         stream.bit_rate = 8_000_000  # so that levels stay
@@ -54,9 +54,9 @@ def _encoded(codec: str, between: int, group: int) -> _Stream:
         for number in range(_FRAMES):
             frame = av.VideoFrame.from_ndarray(np.full(_SIZE_PX[::-1], _grey_of(number), np.uint8), format="gray")
             frame.pts, frame.time_base = number, Fraction(1, 10)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    with av.open(io.BytesIO(out.getvalue())) as source:
+            target.mux(stream.encode(frame))
+        target.mux(stream.encode(None))
+    with av.open(io.BytesIO(out.getvalue()), "r") as source:
         header = bytes(source.streams.video[0].codec_context.extradata or b"")
         packets = [
             (bytes(packet), round(float(packet.pts * packet.time_base) * 10), bool(packet.is_keyframe))
@@ -121,7 +121,7 @@ def _video(rng: Rng) -> tuple[bytes, Check]:
         kept = np.arange(len(times_s))
         lost = len(times_s) - count
         if between and form in ("mp4", "mov") and 0 < lost <= 2:
-            # libavformat leaves out the last frames of the file where an edit ends with a key frame: a warning counts them
+            # libavformat leaves out the last frames of a file where an edit ends with a key frame: a warning states it
             kept = kept[~np.isin(kept + cut, [number for _content, number, _is_key in stream.packets[-lost:]])]
         if count != len(kept):
             return f"{count} of {len(times_s)} frames ({what}; {index.warnings})"
