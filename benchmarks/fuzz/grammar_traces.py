@@ -88,7 +88,10 @@ def _trace(rng: Rng) -> tuple[bytes, Check]:
     if form.time_unit == "iso" or chance(rng):
         begins = datetime(2018, 1, 1, tzinfo=UTC) + timedelta(seconds=int(rng.integers(0, 400_000_000)))
     unit, axes = str(pick(rng, *_PER_UT)), str(pick(rng, "ISO8855", "FLU", "FRD"))
-    field_ut = rng.uniform(-150, 150, (sensors, 3)) + np.array((20, 5, -45)) + rng.normal(0, 2, (count, sensors, 3))
+    offset_ut = rng.uniform(-150, 150, (sensors, 3))
+    # fields that agree within 20 % are taken to be the earth's, whose size is checked (_check_unit): offsets differ
+    offset_ut[:, 0] = 120 * (-1.0) ** np.arange(sensors) + offset_ut[:, 0] / 5
+    field_ut = offset_ut + np.array((20, 5, -45)) + rng.normal(0, 2, (count, sensors, 3))
     missing = rng.random((count, sensors)) < float(pick(rng, 0.0, 0.05))
     recorded = field_ut * np.array((1, -1, -1) if axes == "FRD" else (1, 1, 1)) * _PER_UT[unit]
     recorded[missing] = np.nan
