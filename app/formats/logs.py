@@ -81,7 +81,7 @@ _LEAP_SECONDS = (
     457_056_009, 504_489_610, 551_750_411, 599_184_012, 820_108_813, 914_803_214, 1_025_136_015, 1_119_744_016,
     1_167_264_017,
 )  # fmt: skip
-"""GPS times after which UTC is behind by one more second (IERS bulletin C, up to 2017; none since)."""
+"""GPS times of the leap seconds, after which UTC is behind by one more second (IERS bulletin C; none since 2017)."""
 _EARLIEST_S, _LATEST_S = 946_684_800.0, 4_102_444_800.0  # [s] the years 2000 to 2100
 _LEAP_SECOND = re.compile(r"(:\d\d):60(?=\D|$)")
 _LOCAL_DATE = re.compile(
@@ -184,7 +184,7 @@ class LogClock(Declaration):
             seconds = self._from_number(value)
         elif isinstance(value, str) and len(value) <= _MAX_TEXT:
             text = value.strip()
-            seconds = self._from_number(float(text)) if _NUMBER.match(text) else self._from_text(text)
+            seconds = self._from_number(float(text)) if _NUMBER.match(text) else self.from_text(text)
         else:
             return NOWHEN
         seconds += self.offset_s
@@ -205,9 +205,12 @@ class LogClock(Declaration):
         seconds = value * _SCALE_S[scale]
         return utc_from_gps_s(seconds) if scale in (TimeScale.GPS_S, TimeScale.GPS_MS) else seconds
 
-    def _from_text(self, text: str) -> float:
+    def from_text(self, text: str) -> float:
+        """Seconds since 1970-01-01 UTC of a text that is no number, of any year; NaN where it is no time. [s]"""
         if len(text) < 10:
             return NOWHEN
+        if text[-1] == "z":  # RFC 3339, section 5.6
+            text = f"{text[:-1]}Z"
         leap = ":60" in text and _LEAP_SECOND.search(text) is not None
         try:
             at = datetime.fromisoformat(_LEAP_SECOND.sub(r"\1:59", text) if leap else text)
@@ -259,8 +262,11 @@ def _zone_s(zone: str) -> float:
 
 
 def utc_from_gps_s(gps_s: float) -> float:
-    """Seconds since 1970-01-01 UTC of seconds since the start of GPS time. [s]"""
-    return gps_s + GPS_EPOCH_S - sum(gps_s >= leap for leap in _LEAP_SECONDS)
+    """Seconds since 1970-01-01 UTC of seconds since the start of GPS time. [s]
+
+    A leap second is that which follows it, as in texts and in POSIX: 23:59:60 is the next day's 00:00:00.
+    """
+    return gps_s + GPS_EPOCH_S - sum(gps_s >= leap + 1 for leap in _LEAP_SECONDS)
 
 
 _WEEK_S = 7 * 86_400.0
@@ -292,8 +298,8 @@ def describe_rollover(time_s: float, reference_s: float) -> str | None:
 
 
 def has_zone(text: str) -> bool:
-    """Whether a text in RFC 3339 names its zone."""
-    return re.search(r"(?:[zZ]|[+-]\d\d:?\d\d)\s*\Z", text) is not None
+    """Whether a text with a time of day names its zone, also by hours alone, as PostgreSQL writes it."""
+    return re.search(r"(?:[zZ]|[ Tt]\d\d.*[+-]\d\d(?::?\d\d)?)\s*\Z", text) is not None
 
 
 # === The datum of positions in logs: they must be in WGS 84 / ITRF.

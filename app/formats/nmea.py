@@ -287,7 +287,7 @@ def _take_position(entry: int, kind: str, second_s: float, sentence: Any, readin
     epoch = reading.epoch_at(entry, second_s)
     if kind == "GST":
         north_m, east_m = _figure(sentence.stdLat), _figure(sentence.stdLong)
-        epoch.accuracy_m = math.sqrt((north_m**2 + east_m**2) / 2)
+        epoch.accuracy_m = math.hypot(north_m, east_m)
         return
     if kind == "RMC":
         if isinstance(sentence.date, date):
@@ -344,7 +344,11 @@ def _points(epochs: list[_Epoch], clock: LogClock, day: date | None, report: Log
         raise InvalidParameter(
             "no sentence has a date (RMC or ZDA)", field="poses.date", cure="declare the UTC date of the first position"
         )
-    current = _day_of_first(epochs, first) if first is not None else day
+    if first is not None:
+        current = _day_of_first(epochs, first, epochs[first].day)
+    else:
+        placed = next((i for i, epoch in enumerate(epochs) if not epoch.void and not math.isnan(epoch.lon_deg)), 0)
+        current = _day_of_first(epochs, placed, day)
     last_s = midnight_s = math.nan
     dated: date | None = None
     for epoch in epochs:
@@ -367,9 +371,8 @@ def _points(epochs: list[_Epoch], clock: LogClock, day: date | None, report: Log
         yield PosePoint(epoch.entry, at_s, epoch.lon_deg, epoch.lat_deg, heading_deg, epoch.accuracy_m)
 
 
-def _day_of_first(epochs: list[_Epoch], dated: int) -> date | None:
-    """The date of the first epoch, counted back from the first epoch that has one."""
-    day = epochs[dated].day
+def _day_of_first(epochs: list[_Epoch], dated: int, day: date | None) -> date | None:
+    """The date of the first epoch, counted back from another one that has a date."""
     for later, earlier in zip(reversed(epochs[1 : dated + 1]), reversed(epochs[:dated]), strict=True):
         if day is not None and earlier.second_s - later.second_s > _HALF_DAY_S:
             day -= timedelta(days=1)

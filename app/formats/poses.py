@@ -239,6 +239,9 @@ def _point_of(entry: int, cells: list[str], places: Mapping[str, int], clock: Lo
 
 _HEAD_CHARS = 1 << 14  # [character] in which the root element stands
 _GPX_LEAP_SECOND = re.compile(r"(\d{4}-\d\d-\d\dT(?:[01]\d|2[0-3]):[0-5]\d):60((?:\.\d+)?(?:Z|[+-]\d\d:?\d\d)?\s*<)")
+_GPX_PREFIX = re.compile(r"<(\w+):gpx[\s>]")
+_COURSES = ("heading", "course", "bearing")
+"""Names in extensions, those of a compass first."""
 
 
 def is_gpx(text: str) -> bool:
@@ -263,6 +266,8 @@ def read_gpx(source: PoseSource) -> Iterator[PosePoint]:
         raise UnreadableUpload(
             f"{name} has a document type or entities", field=FIELD, limit="plain GPX", cure="export the track again"
         )
+    if prefix := _GPX_PREFIX.search(text[:_HEAD_CHARS]):  # gpxpy knows elements of the default namespace only
+        text = re.sub(rf"(</?){prefix[1]}:", r"\1", text).replace(f"xmlns:{prefix[1]}=", "xmlns=", 1)
     if text.count("<trkpt") > source.limits.points:
         raise too_many_points(name, source.limits)
     if not is_gpx(text):
@@ -308,13 +313,11 @@ def _course(point: gpxpy.gpx.GPXTrackPoint) -> float:
     nodes: list[Any] = list(point.extensions or ())
     for node in nodes[:20]:
         nodes += list(node)[:20]
-    for node in nodes[:200]:
-        if str(node.tag).rsplit("}", 1)[-1].lower() in ("heading", "course", "bearing"):
-            try:
-                return read_number(node.text)
-            except ValueError:
-                return math.nan
-    return math.nan
+    named = {str(node.tag).rsplit("}", 1)[-1].lower(): node.text for node in reversed(nodes[:200])}
+    try:
+        return next((read_number(named[name]) for name in _COURSES if name in named), math.nan)
+    except ValueError:
+        return math.nan
 
 
 # === Formats of tracks: how each is detected and read.

@@ -37,6 +37,7 @@ BOMS = (
 _C1_CONTROL = re.compile(rb"[\x80-\x9f]")  # printable in Windows-1252, never in ISO 8859-1
 _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f]")
 _BLANK = "\r \t\ufeff"
+_BLANK_BESIDE_TABS = "\r \ufeff"  # a tab at either end of a row is an empty cell
 
 
 def count_of(number: int, what: str) -> str:
@@ -156,11 +157,11 @@ def clean_text(value: object, length: int = MAX_NAME) -> str | None:
     return text or None
 
 
-def numbered_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Lines that are not empty, with their numbers from 0."""
+def numbered_lines(text: str, blank: str = _BLANK) -> Iterator[tuple[int, str]]:
+    """Lines that are not empty, with their numbers from 0, without blanks around them."""
     for number, line in enumerate(text.split("\n")):
-        stripped = line.strip(_BLANK)
-        if stripped:
+        stripped = line.strip(blank)
+        if stripped and not stripped.isspace():
             yield number, stripped
 
 
@@ -339,10 +340,10 @@ class DelimitedLog:
     @classmethod
     def open(cls, text: str) -> DelimitedLog:
         """A log whose first line that is not empty is the header."""
-        _number, header = next(numbered_lines(text), (0, ""))
+        _number, header = next(numbered_lines(text, _BLANK_BESIDE_TABS), (0, ""))
         header = header[:_MAX_HEADER]
         dialect = detect_dialect(header)
-        names = split_header(header.lstrip("#").strip(), dialect.delimiter)
+        names = split_header(header.lstrip("#").strip(_BLANK_BESIDE_TABS), dialect.delimiter)
         return cls(tuple(name[:MAX_NAME] for name in names[:_MAX_LOG_COLUMNS]), dialect, text)
 
     def places(self, aliases: Mapping[str, Sequence[str]], declared: Mapping[str, str]) -> dict[str, int]:
@@ -351,7 +352,7 @@ class DelimitedLog:
 
     def rows(self) -> Iterator[list[str] | None]:
         """Cells of each row after the header; None where a row has another number of cells or cannot be split."""
-        lines = numbered_lines(self.text)
+        lines = numbered_lines(self.text, _BLANK_BESIDE_TABS if self.dialect.delimiter == "\t" else _BLANK)
         next(lines, None)
         for _number, line in lines:
             yield self._cells(line) if len(line) <= MAX_LINE else None
@@ -367,7 +368,13 @@ class DelimitedLog:
                 cells = next(csv.reader([line], delimiter=delimiter, strict=True), [])
             except csv.Error:
                 return None
-        return cells if len(cells) == len(self.columns) else None
+        columns = self.columns
+        if len(cells) == len(columns):
+            return cells
+        is_padded = not any(map(str.strip, cells[len(columns) :])) and not any(columns[len(cells) :])
+        if delimiter == "\t" and is_padded:  # tabs at the end of the header only, or of the rows only
+            return [*cells[: len(columns)], *([""] * (len(columns) - len(cells)))]
+        return None
 
     def bad_row(self) -> str:
         """Why `rows` returns None."""
@@ -479,6 +486,8 @@ def _parse_block(block: bytes, width: int, dialect: Dialect) -> Floats | None:
     if block.count(delimiter) != count * (width - 1) or block.translate(None, _NUMERIC + b"," + delimiter):
         return None
     if dialect.decimal == ",":
+        if b"." in block:  # perhaps between thousands
+            return None
         block = block.replace(b",", b".")
     empty_cells = (delimiter * 2, delimiter + b"\n", delimiter + b"\r", b"\n" + delimiter)
     if any(empty in b"\n" + block for empty in empty_cells) or not _rows_have(block, delimiter, width):

@@ -86,7 +86,7 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
         time_base = Fraction(1) / Fraction(rate_hz or 1) if file.kind is VideoKind.MJPEG else stream.time_base
         expected_s = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else None
         created_at = _created_at(container)
-        codec = str(stream.codec_context.name)
+        codec, declared = str(stream.codec_context.name), int(stream.frames)
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
     distinct = np.diff(ordered, prepend=ordered[0] - 1) > 0
@@ -111,6 +111,10 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
     if damaged:
         warnings.append(f"{damaged} packets without a time are left out")
     gaps = _find_gaps(time_s, expected_s, missing)
+    hidden = declared - len(stamps) - damaged
+    if file.kind is VideoKind.MP4 and hidden > 0 and not any(gap.before_frame is None for gap in gaps):
+        # libavformat may also leave out the last frame in the order of decoding where an edit ends with a key frame
+        warnings.append(f"the edit list of the video leaves out {hidden} of its {declared} frames")
     segments = cut_segments(time_s, keys, limits)
     if is_counted(file.kind, codec):
         # frames that are shown before a key frame and decoded after it need the frames before the key frame, too

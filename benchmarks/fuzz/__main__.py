@@ -21,6 +21,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=__doc__)
     parser.add_argument("items", nargs="*", default=["parsers", "grammar", "frames", "registry"])
     parser.add_argument("--files", type=int, default=10_000, help="of each grammar")
+    parser.add_argument("--seed", type=int, default=1, help="of the grammars: other files")
     parser.add_argument("--seconds", type=float, default=600.0, help="for each parser")
     parser.add_argument("--mutations", type=int, default=100_000, help="of pictures")
     parser.add_argument("--runs", type=int, default=2000, help="of the registry, of 50 steps each, on each database")
@@ -39,7 +40,7 @@ def main() -> int:
     for name in list_grammars():
         if name not in args.items and "grammar" not in args.items:
             continue
-        compared = compare(name, args.files)
+        compared = compare(name, args.files, args.seed)
         read = compared.tried - compared.refused
         _print(f"{name}, valid", compared.tried, read, compared.refused, 0.0, compared.failures)
         failures += compared.failures

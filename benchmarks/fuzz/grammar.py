@@ -50,7 +50,13 @@ def compare(name: str, files: int, seed: int = 1) -> Compared:
 
 def list_grammars() -> dict[str, Grammar]:
     """All of them by name."""
+    from benchmarks.fuzz.grammar_drives import DRIVE_GRAMMARS
     from benchmarks.fuzz.grammar_logs import LOG_GRAMMARS
+    from benchmarks.fuzz.grammar_packets import PACKET_GRAMMARS
     from benchmarks.fuzz.grammar_roads import ROAD_GRAMMARS
+    from benchmarks.fuzz.grammar_traces import TRACE_GRAMMARS
+    from benchmarks.fuzz.grammar_tracks import TRACK_GRAMMARS
+    from benchmarks.fuzz.grammar_videos import VIDEO_GRAMMARS
 
-    return LOG_GRAMMARS | ROAD_GRAMMARS
+    of_logs = LOG_GRAMMARS | PACKET_GRAMMARS | TRACK_GRAMMARS | TRACE_GRAMMARS
+    return of_logs | DRIVE_GRAMMARS | VIDEO_GRAMMARS | ROAD_GRAMMARS

@@ -434,3 +434,47 @@ def test_magnetometers_are_a_trace(tmp_path: Path) -> None:
     assert "/mag_8 (sensor_msgs/msg/MagneticField)" in refused.value.message
     assert "sensor_msgs/Image" in str(refused.value.limit)
     assert "declare the trace" in str(refused.value.cure)
+
+
+def test_publishers_of_one_topic_have_channels_of_their_own() -> None:
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    listed = bag_fields(store, 3, 60)
+    out = io.BytesIO()
+    writer = Writer(out)
+    writer.start(profile="ros2")
+    channels: dict[tuple[str, int], int] = {}
+    for number, (topic, kind, at, message) in enumerate([*_messages(store), *listed]):
+        key = (topic, number % 2)
+        if key not in channels:
+            channels[key] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b""))
+        writer.add_message(channels[key], at, bytes(store.serialize_cdr(message, kind)), at)
+    writer.finish()
+    index = _indexed(out.getvalue())
+    assert len(index.time_s) == FRAMES
+    assert index.track is not None
+    assert len(index.track.time_s) == FRAMES
+    assert not any("/gps/fix" in warning for warning in index.warnings)
+    read = read_trace({"drive": out.getvalue()}, TraceDeclaration(bar=bar_of(3), axes="FLU"))
+    assert read.trace.field_ut.shape == (60, 3, 3)
+
+
+def test_a_summary_without_channels_is_no_index() -> None:
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    for options in ({"repeat_channels": False}, {"repeat_schemas": False}):
+        out = io.BytesIO()
+        writer = Writer(out, **options)
+        writer.start(profile="ros2")
+        topic, kind, at, message = _messages(store)[0]
+        channel = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b""))
+        writer.add_message(channel, at, bytes(store.serialize_cdr(message, kind)), at)
+        writer.finish()
+        with pytest.raises(UnreadableUpload, match="has no index"):
+            _indexed(out.getvalue())
+
+
+def test_further_topics_of_speeds_are_named() -> None:
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    listed = bag_fields(store, 3, 60)
+    listed += [("/wheels", kind, at, message) for topic, kind, at, message in listed if topic == "/speed"]
+    read = read_trace({"drive": mcap(listed)}, TraceDeclaration(bar=bar_of(3), axes="FLU"))
+    assert any("not /wheels" in warning for warning in read.report.warnings)

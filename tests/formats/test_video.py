@@ -201,6 +201,7 @@ def test_frames_that_the_edit_list_leaves_out_are_not_shown(between: int) -> Non
     index = indexed(trimmed(video(40, codec="libx264", group=20, between=between), 3))
     assert index.time_s == pytest.approx(np.arange(37) / 10, abs=1e-3)
     shown = levels(index)
+    assert index.warnings == ("the edit list of the video leaves out 3 of its 40 frames",)
     assert [number for number, _level in shown] == list(range(37))
     for number, level in shown:
         assert abs((number + 3) % 30 - level) <= 1, (number, level)

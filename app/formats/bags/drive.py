@@ -116,6 +116,7 @@ class BagFields(NamedTuple):
     t_s: Floats  # shape (N,): times of the first sensor. [s since 1970]
     field_t: npt.NDArray[np.float32]  # shape (N, S, 3): as published; in tesla by the definition of the message
     speed: tuple[Floats, Floats] | None  # [m/s] times [s since 1970] and speeds
+    unused_speeds: tuple[str, ...]  # topics of further speeds
 
 
 def read_fields(file: SpooledFile, sensors: int, max_rows: int) -> BagFields:
@@ -147,7 +148,8 @@ def read_fields(file: SpooledFile, sensors: int, max_rows: int) -> BagFields:
         speed = _read(bag, speeds[0][0], lambda m: [_SPEEDS[speeds[0][1]](m)], max_rows) if speeds else None
     t_s = series[0][0]
     field_t = np.stack([_at(t_s, *one) for one in series], axis=1).astype(np.float32)
-    return BagFields(t_s, field_t, None if speed is None else (speed[0], speed[1][:, 0]))
+    unused = tuple(name for name, _type in speeds[1:])
+    return BagFields(t_s, field_t, None if speed is None else (speed[0], speed[1][:, 0]), unused)
 
 
 def _field(message: Any) -> list[float]:

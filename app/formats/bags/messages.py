@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
@@ -121,8 +122,8 @@ class Bag:
 
     def __init__(self, kind: BagKind, reader: Any) -> None:
         self._kind, self._reader = kind, reader
-        self.topics: list[Topic] = list(self._list_topics())
-        self._types: dict[str, Typestore] = {}  # by encoding
+        # each publisher of a topic has a connection, or a channel, of its own
+        self.topics: list[Topic] = list({topic.name: topic for topic in self._list_topics()}.values())
 
     def messages(
         self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
@@ -156,8 +157,6 @@ class Bag:
         UnreadableUpload
             It is damaged.
         """
-        from rosbags.typesys import Stores, get_typestore
-
         topic = message.topic
         if topic.encoding not in (CDR, ROS1):
             raise UnsupportedUpload(
@@ -165,10 +164,7 @@ class Bag:
                 limit=f"{CDR} (ROS 2) or {ROS1}", cure="convert the recording to a ROS 2 bag",
             )  # fmt: skip
         with _defects():
-            if topic.encoding not in self._types:
-                store = Stores.ROS1_NOETIC if topic.encoding == ROS1 else Stores.ROS2_HUMBLE
-                self._types[topic.encoding] = get_typestore(store)
-            types = self._types[topic.encoding]
+            types = _types_of(topic.encoding)
             package, _, name = topic.type_name.partition("/")
             type_name = f"{package}/msg/{name.removeprefix('msg/')}"
             if topic.encoding == ROS1:
@@ -185,11 +181,26 @@ class Bag:
                 yield from (Topic(*topic) for topic in self._reader.topics)
                 return
             summary = self._reader.get_summary()
-            if summary is None:
+            if summary is None or not _lists_channels(summary):
                 raise _damaged()
             for channel in summary.channels.values():
                 schema = summary.schemas.get(channel.schema_id)
                 yield Topic(channel.topic, schema.name if schema else "", channel.message_encoding)
+
+
+@cache
+def _types_of(encoding: str) -> Typestore:
+    """Types of messages; once in a process, because the code that reads each type is compiled when it is first used."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if encoding == ROS1 else Stores.ROS2_HUMBLE)
+
+
+def _lists_channels(summary: Any) -> bool:
+    """Whether a summary repeats the channels and schemas of its file, which it may leave out."""
+    if not summary.channels:
+        return summary.statistics is not None and not summary.statistics.channel_count
+    return all(not c.schema_id or c.schema_id in summary.schemas for c in summary.channels.values())
 
 
 def _message(topic: Topic, time_ns: int, data: Any) -> BagMessage:

@@ -314,7 +314,7 @@ def _from_things_stack(entry: int, record: Mapping[str, object], clock: LogClock
     if record.get("simulated"):
         raise BrokenEntry("simulated", "a simulated uplink: nothing was received")
     payload = _payload_of(uplink.get("frm_payload"), PayloadText.BASE64)
-    best = _best(_objects(uplink.get("rx_metadata")))
+    best = _best(_objects(uplink.get("rx_metadata")), "rssi", "channel_rssi")
     settings = uplink.get("settings")
     times = (
         uplink.get("received_at"),
@@ -476,9 +476,13 @@ def _objects(value: object) -> list[dict[str, object]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def _best(receptions: list[dict[str, object]], rssi: str = "rssi") -> dict[str, object]:
+def _best(receptions: list[dict[str, object]], rssi: str = "rssi", other_rssi: str = "") -> dict[str, object]:
     """The reception of the strongest gateway; an RSSI of zero, which is left out, was not measured."""
-    return max(receptions, key=lambda reception: _signal(reception.get(rssi), -math.inf), default={})
+    return max(
+        receptions,
+        key=lambda reception: _signal(reception.get(rssi), _signal(reception.get(other_rssi), -math.inf)),
+        default={},
+    )
 
 
 def _first_time(values: tuple[object, ...], clock: LogClock) -> float:
@@ -534,14 +538,25 @@ def _each_packet(records: Iterator[Record]) -> Iterator[Record]:
     """Records; each packet of a datagram of Semtech's gateways, which holds several, is one of its own."""
     more = 0
     for entry, record in records:
-        packets = record.get("rxpk") if isinstance(record, dict) else None
-        if not isinstance(packets, list):
+        packets = _datagram_of(record) if isinstance(record, dict) else None
+        if packets is None:
             yield entry + more, record
             continue
         for packet in packets:
             yield entry + more, _checked(packet)
             more += 1
         more -= 1
+
+
+def _datagram_of(record: dict[str, object]) -> list[object] | None:
+    """The packets of a datagram, also in an envelope; None if it is none."""
+    if "rxpk" not in record and find_kind(record) is None:
+        inner = next((record[name] for name in _ENVELOPES if _is_event(record.get(name))), None)
+        if isinstance(inner, str) and '"rxpk"' in inner:
+            inner = _parse(inner)
+        record = inner if isinstance(inner, dict) else record
+    packets = record.get("rxpk")
+    return packets if isinstance(packets, list) else None
 
 
 def _packet_from_record(

@@ -60,7 +60,7 @@ def find_other_format(data: bytes) -> str | None:
 def _detect_json(sample: Sample) -> Confidence:
     if not sample.is_text:
         return Confidence.NONE
-    if sample.start.startswith(("{", "[")):
+    if sample.start.lstrip("\x1e").startswith(("{", "[")):  # RFC 7464 puts a record separator before each text
         return Confidence.CERTAIN
     return Confidence.LIKELY if looks_like_json_dump(sample.text) else Confidence.NONE
 

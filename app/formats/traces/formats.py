@@ -133,6 +133,9 @@ def _read_bag(part: Part, reading: TraceReading) -> None:
     if reading.declaration.unit is None:
         np.multiply(found.field_t, np.float32(_UT_PER_TESLA), out=found.field_t)
         reading.contents.unit = "uT"
+    if found.unused_speeds:
+        shown = ", ".join(name[:80] for name in found.unused_speeds[:8])
+        reading.report.warn(f"{part.name} has several topics of speeds; the first by name is used, not {shown}")
     if found.speed is not None:
         reading.contents.speeds.append(
             (Series(f"the speed in {part.name}", found.speed[0] + shift_s, found.speed[1]), "m/s")

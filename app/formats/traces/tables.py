@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
+from app.formats.logs import LogClock
 from app.formats.text import (
     Dialect,
     NumberColumns,
@@ -247,8 +247,10 @@ def _check_delimiter(part: Part, names: Sequence[str], columns: TraceColumns) ->
 def _text_to_seconds(text: str) -> float:
     if not text.strip():
         return math.nan
-    moment = datetime.fromisoformat(text.strip())
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    seconds = LogClock().from_text(text.strip())
+    if math.isnan(seconds):
+        raise ValueError("no time")
+    return seconds
 
 
 def _damaged(part: Part) -> UnreadableUpload:

@@ -74,6 +74,16 @@ def test_ways_to_write_a_table(text: str) -> None:
     assert read(text).packets == read(PAPER).packets
 
 
+def test_cells_at_the_ends_of_rows_may_be_empty_between_tabs() -> None:
+    text = "altitude\tid\tlatitude\tlongitude\trssi\n\t7\t42\t-85\t-108\n1.5\t8\t42\t-85\t\n\t9\t42\t-85\t\n"
+    for written in (text, text.replace("\t\n", "\t\t\n"), text.replace("rssi\n", "rssi\t\n")):
+        packets = read(written).packets
+        assert [packet.claim.number for packet in packets if packet.claim] == [7, 8, 9]
+        assert [packet.claim.height_m for packet in packets if packet.claim] == [None, 1.5, None]
+        assert packets[0].rssi_dbm == -108
+        assert math.isnan(packets[2].rssi_dbm)
+
+
 def test_utf_16_is_read() -> None:
     assert read(PAPER.encode("utf-16")).packets == read(PAPER).packets
 
@@ -164,6 +174,7 @@ def test_declared_columns() -> None:
         (f"{AT_S:.3f}", LogClock()),
         ("2026-03-16 13:39:32", LogClock()),
         ("2026-03-16T09:39:32-04:00", LogClock()),
+        ("2026-03-16t13:39:32z", LogClock()),  # RFC 3339, section 5.6
         ("2026-03-16T09:39:32", LogClock(utc_offset_s=-4 * 3600)),
         (1457703590, LogClock(scale=TimeScale.GPS_S)),
         (1457703590000, LogClock(scale=TimeScale.GPS_MS)),
@@ -184,6 +195,9 @@ def test_no_times(written: object) -> None:
 def test_gps_time_at_leap_seconds() -> None:
     # IERS bulletin C 52: UTC - TAI was -36 s until 2017-01-01, -37 s from then on; TAI - GPS is 19 s
     assert utc_from_gps_s(1_167_264_016) == datetime(2016, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()
+    assert (
+        utc_from_gps_s(1_167_264_017.5) == datetime(2017, 1, 1, microsecond=500_000, tzinfo=UTC).timestamp()
+    )  # 23:59:60
     assert utc_from_gps_s(1_167_264_018) == datetime(2017, 1, 1, tzinfo=UTC).timestamp()
     assert utc_from_gps_s(0) == datetime(1980, 1, 6, tzinfo=UTC).timestamp()
 
@@ -195,7 +209,8 @@ def test_what_times_do_not_say_is_said() -> None:
     assert "without a zone" in local.report.warnings[0]
     local = read('{"id": 1, "lat": 42, "lon": -85, "time": "2026-03-16 13:39:32"}\n')
     assert "without a zone" in local.report.warnings[0]
-    assert not read('{"id": 1, "lat": 42, "lon": -85, "time": "2026-03-16T13:39:32Z"}\n').report.warnings
+    for zone in ("Z", "+00", "+0000", "-05:00"):
+        assert not read(f'{{"id": 1, "lat": 42, "lon": -85, "time": "2026-03-16 13:39:32{zone}"}}\n').report.warnings
 
 
 @pytest.mark.parametrize(
@@ -318,6 +333,16 @@ def test_the_things_stack() -> None:
     assert first.event == "70B3D57ED005B89A/AWNbm/4zfqx0jZ5q1NlBmw==/0"
 
 
+def test_the_best_gateway_of_the_things_stack_by_the_rssi_of_its_channel() -> None:
+    event = things_stack(PAYLOAD)
+    event["uplink_message"]["rx_metadata"] = [
+        {"gateway_ids": {"gateway_id": "a"}, "rssi": -120, "channel_rssi": -120, "snr": -12.2},
+        {"gateway_ids": {"gateway_id": "b"}, "channel_rssi": -98, "snr": 4.5},
+    ]
+    (packet,) = read(json.dumps(event)).packets
+    assert (packet.rssi_dbm, packet.snr_db) == (-98.0, 4.5)
+
+
 def test_the_things_stacks_storage_as_documented() -> None:
     log = read(STORED + "\n" + STORED.replace('"f_cnt":43', '"f_cnt":44') + "\n")
     assert payloads(log) == [bytes.fromhex("010a010a010a010a")] * 2
@@ -349,6 +374,11 @@ def test_events_as_they_are_stored(text: str) -> None:
     assert [p.entry for p in log.packets] == [0, 1, 2]
     assert log.report.format == UplinkKind.CHIRPSTACK
     assert not log.report.left_out
+
+
+def test_a_sequence_of_json_texts() -> None:
+    text = "".join(f"\x1e{json.dumps(event)}\n" for event in EVENTS)  # RFC 7464
+    assert payloads(read(text)) == [PAYLOAD] * len(EVENTS)
 
 
 def test_an_event_in_a_console_stream() -> None:
@@ -444,6 +474,8 @@ def test_datagrams_of_gateways() -> None:
     broken = packet | {"stat": -1}
     lines = [{"rxpk": [packet, gps], "stat": {"rxnb": 2}}, {"rxpk": [frame]}, {"rxpk": [broken, packet]}]
     log = read("\n".join(json.dumps(line) for line in lines))
+    enveloped = [{"topic": "up", "payload": json.dumps(lines[0])}, {"topic": "up", "payload": lines[0]}]
+    assert len(read("\n".join(json.dumps(line) for line in enveloped)).packets) == 4
     assert [one.entry for one in log.packets] == [0, 1, 4]
     assert [one.received_at_s for one in log.packets] == [AT_S] * 3
     assert [left.entry for left in log.report.left_out] == [2, 3]

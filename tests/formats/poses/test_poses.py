@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from datetime import UTC, date, datetime
 from time import process_time
 
@@ -236,7 +237,7 @@ def test_headings_and_accuracies() -> None:
     )  # fmt: skip
     assert (track.time_s - AT_S).tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(track.heading_deg, [91.5, 80.0, np.nan, 359.0])
-    assert track.accuracy_m[0] == pytest.approx(np.hypot(0.03, 0.04) / np.sqrt(2))
+    assert track.accuracy_m[0] == pytest.approx(0.05)  # of both axes, as of the covariance in a bag
 
 
 def headed(*order: str, headings: tuple[float, ...] = (0.0, 30.0, 60.0, 90.0)) -> list[str]:
@@ -533,3 +534,31 @@ def test_the_way_driven_leaves_out_wandering_and_gaps() -> None:
     far = PoseTrack([0.0, 1.0, 2.0], [10.0, 11.0, 11.0002], [50.0] * 3, [np.nan] * 3, [np.nan] * 3)
     assert far.driven_m() == pytest.approx(14.34, abs=0.05)
     assert PoseTrack([0.0], [10.0], [50.0], [np.nan], [np.nan]).driven_m() == 0.0
+
+
+def test_gpx_whose_elements_have_a_prefix() -> None:
+    plain = GPX.format(POINT.format(""))
+    prefixed = re.sub(r"(</?)(?=\w+[ >])", r"\1g:", plain).replace("xmlns=", "xmlns:g=")
+    assert "<g:trkpt" in prefixed
+    assert read(prefixed)[0].time_s.tolist() == read(plain)[0].time_s.tolist() == [AT_S]
+
+
+def test_the_compass_of_gpx_counts_more_than_the_course() -> None:
+    both = "<extensions><x:course>10</x:course><heading>350</heading></extensions>"
+    assert read(GPX.format(POINT.format(both)))[0].heading_deg.tolist() == [350.0]
+
+
+def test_the_first_or_last_cell_between_tabs_may_be_empty() -> None:
+    rows = "\t2026-03-16T13:39:32Z\t-85.6\t42.3\t\n9\t2026-03-16T13:39:33Z\t-85.6\t42.3\t1\n"
+    text = f"heading\ttime\tlon\tlat\taccuracy\n{rows}"
+    track, report = read(text)
+    assert (track.time_s - AT_S).tolist() == [0, 1]
+    assert not report.left_out_count
+
+
+def test_a_declared_date_is_that_of_the_first_position() -> None:
+    lost = gga("235959.00", 0)
+    track, _report = read(nmea(lost, gga("000000.00"), gga("000001.00")), date=date(2026, 3, 17))
+    assert track.time_s[0] == datetime(2026, 3, 17, tzinfo=UTC).timestamp()
+    track, _report = read(nmea(gga("235958.00"), lost, gga("000000.00")), date=date(2026, 3, 16))
+    assert track.time_s[-1] == datetime(2026, 3, 17, tzinfo=UTC).timestamp()
