@@ -218,6 +218,7 @@ class TileMatrixSets(TypedDict):
 JSON = "application/json"
 GEOJSON = "application/geo+json"
 SCHEMA = "application/schema+json"
+QUERYABLES_REL = "http://www.opengis.net/def/rel/ogc/1.0/queryables"
 OPENAPI = "application/vnd.oai.openapi+json;version=3.0"
 HTML = "text/html"
 MVT = "application/vnd.mapbox-vector-tile"
