@@ -68,6 +68,17 @@ def reference_system(crs: str | None) -> CRS:
     return named_system(normalize_crs(crs))
 
 
+_UNKNOWN_TO_PROJ = (
+    "Lambert Conic Conformal (West Orientated)",
+    "Bonne (South Orientated)",
+    "Polar Stereographic (variant C)",
+    "Tunisia Mining Grid",
+    "Lambert Conic Near-Conformal",
+    "Transverse Mercator Zoned Grid System",
+)
+"""Projections that PROJ does not compute: 23 of the systems of the registry have one of them."""
+
+
 @lru_cache(maxsize=256)
 def named_system(name: str) -> CRS:
     """The system with a name that `normalize_crs` wrote; raises as `reference_system`."""
@@ -84,6 +95,13 @@ def named_system(name: str) -> CRS:
             field="position.crs",
             limit="geographic or projected",
             cure="give the horizontal system as crs and the height's system as vertical_datum",
+        )
+    if system.is_projected and system.coordinate_operation.method_name in _UNKNOWN_TO_PROJ:
+        raise ReferenceSystemError(
+            f"{name} ({system.name}) is in a projection that is not computed here",
+            field="position.crs",
+            limit=f"others than {', '.join(_UNKNOWN_TO_PROJ)}",
+            cure=_CRS_CURE,
         )
     return system
 
@@ -177,7 +195,7 @@ def systems_of_area(west_deg: float, south_deg: float, east_deg: float, north_de
     found = query_crs_info("EPSG", kinds, box)
     if len(found) > MAX_SYSTEMS:
         found = query_crs_info("EPSG", kinds, box, contains=True)
-    return tuple(sorted(int(system.code) for system in found))
+    return tuple(sorted(int(one.code) for one in found if one.projection_method_name not in _UNKNOWN_TO_PROJ))
 
 
 def wgs84_without_bound(name: str, first: float, second: float) -> tuple[float, float]:

@@ -168,7 +168,7 @@ def api_document(base: str) -> dict[str, object]:
     paths: dict[str, object] = {
         "/": _read("Landing page"),
         "/conformance": _read("Conformance classes"),
-        "/api": _read("This document"),
+        "/api": _read("This document", OPENAPI),
         "/collections": _read("Collections"),
     }
     for collection in COLLECTIONS.values():

@@ -61,7 +61,8 @@ def _list_items(
     collection: Collection, query: ItemsQuery, base: str, caller: CallerValue, features: Features
 ) -> Response:
     if query.hits:
-        hits = _hits(features.count(caller, collection, query.filtered))
+        links = _links(query, f"{base}/collections/{collection.id}", None)
+        hits = _hits(features.count(caller, collection, query.filtered), links)
         if query.is_page:
             return html_response(items_page(base, collection, query, hits, None))
         return answer(hits, GEOJSON, crs=query.crs)
@@ -119,13 +120,13 @@ def get_item(
     return answer(document, GEOJSON, crs=query.crs, headers={"ETag": f'"{version}"'} if version is not None else None)
 
 
-def _hits(matched: int) -> FeaturePage:
+def _hits(matched: int, links: list[Link]) -> FeaturePage:
     return {
         "type": "FeatureCollection",
         "timeStamp": datetime.now(UTC),
         "numberReturned": 0,
         "numberMatched": matched,
-        "links": [],
+        "links": links,
         "features": [],
     }
 

@@ -126,7 +126,7 @@ class Feature(TypedDict):
 
     type: Literal["Feature"]
     id: str
-    geometry: Geometry
+    geometry: Geometry | None  # None outside the area of the CRS
     properties: JsonObject
     links: NotRequired[list[Link]]
 

@@ -21,7 +21,7 @@ import shapely
 import sqlalchemy as sa
 from pyproj.enums import TransformDirection
 
-from app.errors import MalformedRequest, NotFound
+from app.errors import NotFound
 from app.families import FAMILIES
 from app.formats.exports import ExportFrame, frame_records
 from app.geodesy import reference_system
@@ -352,7 +352,7 @@ class Features:
         Raises
         ------
         MalformedRequest
-            There is no line to go on after, or no feature of the page has a place in the CRS.
+            There is no line to go on after.
         """
         agency_id, is_first = caller.agency_id, after is None
         if collection.lines is not None:
@@ -544,13 +544,7 @@ def _joined(features: list[str]) -> orjson.Fragment:
 
 
 def _in_crs(features: Sequence[JsonObject], crs: AnyCrs, origins: Mapping[str, MarkerOrigin]) -> list[JsonObject]:
-    """Features with their coordinates in a CRS; those that it does not reach have no geometry.
-
-    Raises
-    ------
-    MalformedRequest
-        No feature has a place in it.
-    """
+    """Features with their coordinates in a CRS; those that it does not reach have no geometry."""
     parts = [_vertices(feature) for feature in features]
     vertices = [vertex for part in parts for vertex in part]
     if isinstance(crs, OtherCrs):
@@ -591,10 +585,8 @@ def _in_other_crs(
         }  # fmt: skip
         for lon_deg, lat_deg, *up in part:
             records.append({"lon_deg": lon_deg, "lat_deg": lat_deg, "height_m": up[0] if up else None, **same})
-    framed, problem = frame_records(records, ExportFrame(crs.name, vertical_datum=ELLIPSOID, needs_heights=False))
+    framed, _ = frame_records(records, ExportFrame(crs.name, vertical_datum=ELLIPSOID, needs_heights=False))
     _place_roughly(framed, crs)
-    if problem is not None and all(record["x"] is None for record in framed):
-        raise MalformedRequest(problem.message, field="crs", limit=problem.limit, cure=problem.cure)
     order = ("y", "x") if crs.is_north_first else ("x", "y")
     return [
         None if record["x"] is None
