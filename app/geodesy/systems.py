@@ -96,7 +96,8 @@ def named_system(name: str) -> CRS:
             limit="geographic or projected",
             cure="give the horizontal system as crs and the height's system as vertical_datum",
         )
-    if system.is_projected and system.coordinate_operation.method_name in _UNKNOWN_TO_PROJ:
+    operation = system.coordinate_operation if system.is_projected else None
+    if operation is not None and operation.method_name in _UNKNOWN_TO_PROJ:
         raise ReferenceSystemError(
             f"{name} ({system.name}) is in a projection that is not computed here",
             field="position.crs",
