@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import AfterValidator, Field
 from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError
@@ -67,6 +68,17 @@ def reference_system(crs: str | None) -> CRS:
     return named_system(normalize_crs(crs))
 
 
+_UNKNOWN_TO_PROJ = (
+    "Lambert Conic Conformal (West Orientated)",
+    "Bonne (South Orientated)",
+    "Polar Stereographic (variant C)",
+    "Tunisia Mining Grid",
+    "Lambert Conic Near-Conformal",
+    "Transverse Mercator Zoned Grid System",
+)
+"""Projections that PROJ does not compute: 23 of the systems of the registry have one of them."""
+
+
 @lru_cache(maxsize=256)
 def named_system(name: str) -> CRS:
     """The system with a name that `normalize_crs` wrote; raises as `reference_system`."""
@@ -83,6 +95,14 @@ def named_system(name: str) -> CRS:
             field="position.crs",
             limit="geographic or projected",
             cure="give the horizontal system as crs and the height's system as vertical_datum",
+        )
+    operation = system.coordinate_operation if system.is_projected else None
+    if operation is not None and operation.method_name in _UNKNOWN_TO_PROJ:
+        raise ReferenceSystemError(
+            f"{name} ({system.name}) is in a projection that is not computed here",
+            field="position.crs",
+            limit=f"others than {', '.join(_UNKNOWN_TO_PROJ)}",
+            cure=_CRS_CURE,
         )
     return system
 
@@ -159,6 +179,24 @@ def geographic_from(name: str) -> Transformer | None:
     """From a projected system to longitudes and latitudes on its own datum, which is exact; None where it has these."""
     system = named_system(name)
     return Transformer.from_crs(name, system.geodetic_crs, always_xy=True) if system.is_projected else None
+
+
+MAX_SYSTEMS = 2500
+"""Systems in the list of an area; the whole of the United States has 2,046. Keeps the list under 150 kB."""
+
+
+@lru_cache(maxsize=256)
+def systems_of_area(west_deg: float, south_deg: float, east_deg: float, north_deg: float) -> tuple[int, ...]:
+    """EPSG codes of the geographic and projected systems whose area of use meets a box, or covers it if these are many.
+
+    Systems that the registry has replaced (deprecated) are left out.
+    """
+    kinds = [PJType.GEOGRAPHIC_2D_CRS, PJType.PROJECTED_CRS]
+    box = AreaOfInterest(west_deg, south_deg, east_deg, north_deg)
+    found = query_crs_info("EPSG", kinds, box)
+    if len(found) > MAX_SYSTEMS:
+        found = query_crs_info("EPSG", kinds, box, contains=True)
+    return tuple(sorted(int(one.code) for one in found if one.projection_method_name not in _UNKNOWN_TO_PROJ))
 
 
 def wgs84_without_bound(name: str, first: float, second: float) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from sqlalchemy.sql.functions import FunctionElement
 
 from app.geodesy import LocalizationGrade, grade_accuracy, total_accuracy_m
 from app.geodesy.place import stored_frame
+from app.geodesy.systems import ELLIPSOID
 from app.registry.column_types import AnyColumn
 from app.registry.spatial import Area, within_area
 from app.values import JsonObject
@@ -68,6 +69,7 @@ def regraded(values: Mapping[str, Any]) -> dict[str, object]:
 
 
 Value = str | float | datetime
+Bound = float | sa.BindParameter[float]
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
     "=": operator.eq,
     "<>": operator.ne,
@@ -122,6 +124,7 @@ class Located:
 
     area: Area
     strictly: bool = False
+    heights_m: tuple[float, float] | None = None  # [m] lowest and highest ellipsoidal height; one without is in
 
 
 Condition = Compared | Missing | Constant | Not | Joined | Located
@@ -132,8 +135,9 @@ GEOMETRY = "geometry"
 def condition_sql(condition: Condition, columns: dict[str, AnyColumn], table: sa.Table) -> sa.ColumnElement[bool]:
     """The condition as SQL on columns, by their properties' names, and on the places of a table's rows."""
     match condition:
-        case Located(area, strictly):
-            return within_area(area, table, strictly=strictly).self_group()
+        case Located(area, strictly, heights_m):
+            found = within_area(area, table, strictly=strictly)
+            return found.self_group() if heights_m is None else sa.and_(found, between_heights(table, *heights_m))
         case Constant(value):
             return sa.literal(1, sa.Integer) == sa.literal(int(value), sa.Integer)
         case Missing(name):
@@ -159,7 +163,7 @@ def holds(condition: Condition, values: Mapping[str, object]) -> bool | None:
     is unknown. The value of `GEOMETRY` is a shape.
     """
     match condition:
-        case Located(area, strictly):
+        case Located(area, strictly):  # values in hand are of lines, which have no heights
             shape = values[GEOMETRY]
             return bool(shapely.contains(area.shape, shape) if strictly else shapely.intersects(area.shape, shape))
         case Constant(value):
@@ -181,6 +185,13 @@ def holds(condition: Condition, values: Mapping[str, object]) -> bool | None:
             if symbol == "like":
                 return _is_like(str(known), _pattern_parts(str(value)))
             return bool(COMPARISONS[symbol](known, value))
+
+
+def between_heights(table: sa.Table, low_m: Bound, high_m: Bound) -> sa.ColumnElement[bool]:
+    """Rows with an ellipsoidal height in a range, and those without one."""
+    c = table.c
+    other = [c.vertical_datum != ELLIPSOID] if "vertical_datum" in c else []
+    return sa.or_(c.height_m.is_(None), *other, c.height_m.between(low_m, high_m))
 
 
 def pinned_values(condition: Condition | None) -> dict[str, Value]:

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import orjson
 import sqlalchemy as sa
 
-from app.geodesy.systems import ELLIPSOID, is_ellipsoidal
+from app.geodesy.systems import is_ellipsoidal
 from app.markers.reading import MarkerRow
 from app.registry.bulk_load import Columns, JsonTexts, json_objects, json_texts
 from app.registry.column_types import AnyColumn, AnySelect
-from app.registry.conditions import Condition, condition_sql
+from app.registry.conditions import Condition, between_heights, condition_sql
 from app.registry.marker_rows import markers
 from app.registry.plan_states import find_plan_states
 from app.registry.spatial import Box, proposed_by_index
@@ -255,7 +255,7 @@ def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
         conditions.append(sa.or_(*(in_box(k, wide, table.table) for k, wide in enumerate(shape.wide))))
     if shape.heights:
         low, high = sa.bindparam("low", type_=sa.Double), sa.bindparam("high", type_=sa.Double)
-        conditions.append(sa.or_(c.height_m.is_(None), c.vertical_datum != ELLIPSOID, c.height_m.between(low, high)))
+        conditions.append(between_heights(table.table, low, high))
     if shape.since:
         conditions.append(table.changed >= sa.bindparam("since", type_=table.changed.type))
     if shape.until:

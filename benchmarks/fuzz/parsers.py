@@ -16,6 +16,7 @@ from pathlib import Path
 from hypothesis import HealthCheck, Phase, given, settings
 
 from app.api.ogc.cql2 import Reader
+from app.api.ogc.query import places_in
 from app.decoders.cerpm.verify import decode_message
 from app.encoders.cerpm import encode_message
 from app.errors import WaymarkError
@@ -31,7 +32,7 @@ from app.formats.surveys.read import read_survey
 from app.formats.traces.read import read_trace
 from app.markers.cerpm import KEY_BYTES, CerpmMessage
 from app.planning.rules import read_rules
-from app.services.markers.searches import area_of_shape
+from app.services.markers.features import STORAGE_CRS
 from benchmarks.fuzz.mutations import damaged
 from benchmarks.fuzz.pictures import list_pictures
 
@@ -193,7 +194,7 @@ def _filters(language: str) -> Callable[[bytes], object]:
         _KINDS,
         lambda text: datetime.fromisoformat(text).astimezone(UTC),
         float,
-        lambda shape, within_m: area_of_shape(shape, "filter", within_m),
+        places_in(STORAGE_CRS),
     )
 
     def parse(data: bytes) -> object:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from datetime import datetime
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import orjson
 import shapely
@@ -41,18 +41,21 @@ MAX_PATTERNS = 20
 on 200,000 markers."""
 _TOKEN = re.compile(
     r"""\s*(?:
-    (?P<text>'(?:[^']|'')*')
+    (?P<text>'(?:[^'\\]|''|\\.)*')
     | (?P<name>"[^"]{1,80}"|[A-Za-z_][A-Za-z0-9_]{0,79})
     | (?P<number>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)
     | (?P<sign><>|<=|>=|[=<>(),])
     )""",
-    re.ASCII | re.VERBOSE,
+    re.ASCII | re.VERBOSE | re.DOTALL,
 )
+_ESCAPED = re.compile(r"''|\\.", re.DOTALL)
+_CONTROLS = {"a": "\a", "b": "\b", "t": "\t", "n": "\n", "v": "\v", "f": "\f", "r": "\r"}
 _WORDS = ("AND", "OR", "NOT", "IS", "NULL", "LIKE", "BETWEEN", "IN", "TRUE", "FALSE", "TIMESTAMP", "DATE")
 _MIRRORED = {"<": ">", ">": "<", "<=": ">=", ">=": "<="}
+_GEOMETRIES = (GEOMETRY, "geom")
 SPATIAL = ("S_INTERSECTS", "S_WITHIN", "S_DISJOINT", "S_DWITHIN")
 _OLD_SPATIAL = {name.removeprefix("S_"): name for name in SPATIAL}
-_WKT = ("POINT", "LINESTRING", "POLYGON", "MULTIPOINT", "MULTILINESTRING", "MULTIPOLYGON")
+_WKT = ("POINT", "LINESTRING", "POLYGON", "MULTIPOINT", "MULTILINESTRING", "MULTIPOLYGON", "GEOMETRYCOLLECTION")
 _M_PER_UNIT = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
     **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1000.0),
@@ -62,7 +65,17 @@ _M_PER_UNIT = {
 MAX_SPATIAL = 20
 """Spatial conditions, each of which asks the index and compares what it finds. Bounds the time; chosen by hand."""
 Token = tuple[str, str]
-Place = Callable[[shapely.Geometry, float], Area]
+Sides = tuple[float, ...]  # numbers of a BBOX: four, or six with heights
+
+
+class Placed(NamedTuple):
+    """A geometry or a box of a filter: the areas that it consists of, and the heights of a box that has some."""
+
+    areas: tuple[Area, ...]
+    heights_m: tuple[float, float] | None = None
+
+
+Place = Callable[[shapely.Geometry | Sides, float], Placed]
 Moment = Callable[[str], datetime]
 Number = Callable[[str], float]
 
@@ -77,7 +90,7 @@ class Reader:
     moment, number : callable
         The moment or the number that a text says.
     place : callable
-        The area of a geometry in the filter's CRS, with all that is within a distance of it. [m]
+        The areas of a geometry or a box in the filter's CRS, with all that is within a distance of it. [m]
     """
 
     def __init__(self, kinds: Mapping[str, str], moment: Moment, number: Number, place: Place) -> None:
@@ -115,15 +128,26 @@ class Reader:
             refuse_filter(f"LIKE compares {name} with a pattern", "a property that is text, a pattern that is text")
         return Compared(name, symbol, self._of_kind(name, kind, value))
 
-    def located(self, name: str, operator: str, shape: shapely.Geometry, within_m: float = 0.0) -> Condition:
-        """A comparison of the geometry with another one."""
-        if name not in (GEOMETRY, "geom"):
+    def missing(self, name: str) -> Condition:
+        """Whether a property has no value; every feature has a geometry."""
+        if name in _GEOMETRIES:
+            return Constant(False)
+        self.kind_of(name)
+        return Missing(name)
+
+    def located(self, name: str, operator: str, shape: shapely.Geometry | Sides, within_m: float = 0.0) -> Condition:
+        """A comparison of the geometry with another one, or with a box."""
+        if name not in _GEOMETRIES:
             refuse_filter(f"{name[:80]} is no geometry", f"{operator} compares {GEOMETRY} with a geometry")
-        if not isinstance(shape, shapely.Geometry) or shape.is_empty or not shape.is_valid:
+        if isinstance(shape, shapely.Geometry) and (shape.is_empty or not shape.is_valid):
             refuse_filter("a geometry in the filter is empty or crosses itself", "valid points, lines and polygons")
         if operator == "S_DWITHIN" and not within_m > 0:
             refuse_filter("S_DWITHIN has no distance above 0", "S_DWITHIN(geometry, POINT(8.4 49), 500, 'm')")
-        condition = Located(self._place(shape, within_m), operator == "S_WITHIN")
+        if operator == "S_WITHIN" and isinstance(shape, shapely.GeometryCollection):
+            refuse_filter("S_WITHIN compares with a GEOMETRYCOLLECTION", "its parts, joined by OR")
+        areas, heights_m = self._place(shape, within_m)
+        found = tuple(Located(area, operator == "S_WITHIN", heights_m) for area in areas)
+        condition = found[0] if len(found) == 1 else Joined(False, found)
         return Not(condition) if operator == "S_DISJOINT" else condition
 
     def kind_of(self, name: str) -> str:
@@ -149,6 +173,12 @@ class Reader:
 def refuse_filter(message: str, limit: str, cure: str = "/ogc/api describes the parameters") -> NoReturn:
     """Refuse a filter."""
     raise MalformedRequest(message, field="filter", limit=limit, cure=cure)
+
+
+def refuse_function(name: str) -> NoReturn:
+    """Refuse a function that is not offered."""
+    known = ", ".join(SPATIAL)
+    refuse_filter(f"there is no function {name[:40].upper()}", known, f"the functions in filters are {known}")
 
 
 def _count(condition: Condition, counts: Callable[[Condition], bool] = lambda _condition: True) -> int:
@@ -210,7 +240,10 @@ class _Text:
         if self._peek()[0] == "name":
             name = self._next()[1]
             operator = _OLD_SPATIAL.get(name.upper(), name.upper())
-            return self._spatial(operator) if operator in SPATIAL and self._takes("(") else self._about(name)
+            if operator in SPATIAL and self._takes("("):
+                return self._spatial(operator)
+            self._refuse_call(name)
+            return self._about(name)
         value = self._value()
         symbol = self._comparison()
         kind, name = self._next()
@@ -239,28 +272,34 @@ class _Text:
             refuse_filter(f"{operator} compares {GEOMETRY} with a geometry", f"{operator}({GEOMETRY}, POINT(8.4 49))")
         return self._reader.located(name, operator, shape, within_m)
 
-    def _place(self) -> str | shapely.Geometry:
+    def _refuse_call(self, name: str) -> None:
+        """Refuse the function that a name calls."""
+        if self._peek() == ("sign", "("):
+            refuse_function(name)
+
+    def _place(self) -> str | shapely.Geometry | Sides:
         """The name of a property, or a geometry in well-known text or as BBOX."""
         kind, name = self._next()
         if kind != "name":
             self._at -= 1
             self._unexpected()
         if name.upper() not in (*_WKT, "BBOX"):
+            self._refuse_call(name)
             return name
         words, depth = [name.upper()], 0
-        if self._peek()[1].upper() == "Z":
-            words.append(self._next()[1])
+        inner = ("Z", *_WKT) if name.upper() == "GEOMETRYCOLLECTION" else ("Z",) * (name.upper() != "BBOX")
         while True:
             kind, text = self._next()
-            if kind != "number" and (kind != "sign" or text not in "(),"):
+            is_inner = kind == "name" and text.upper() in inner and (depth or len(words) == 1)
+            if kind != "number" and not is_inner and (kind != "sign" or text not in "(),"):
                 self._at -= 1
                 self._unexpected()
             depth += (text == "(") - (text == ")")
-            words.append(text)
-            if not depth:
+            words.append(text.upper())
+            if not depth and not is_inner:
                 break
         if name.upper() == "BBOX":
-            return _box_of([self._reader.number(word) for word in words if word not in ("BBOX", "(", ")", ",")])
+            return _sides([self._reader.number(word) for word in words if word not in ("BBOX", "(", ")", ",")])
         try:
             return shapely.from_wkt(" ".join(words))
         except ShapelyError:
@@ -270,15 +309,15 @@ class _Text:
         if self._takes("IS"):
             negated = self._takes("NOT")
             self._expect("NULL")
-            self._reader.kind_of(name)
-            return Not(Missing(name)) if negated else Missing(name)
+            condition = self._reader.missing(name)
+            return Not(condition) if negated else condition
         negated = self._takes("NOT")
         condition = self._ranged(name, negated)
         return Not(condition) if negated else condition
 
     def _ranged(self, name: str, negated: bool) -> Condition:
         if self._takes("LIKE"):
-            return self._reader.compared(name, "like", self._value())
+            return self._reader.compared(name, "like", self._value(is_pattern=True))
         if self._takes("BETWEEN"):
             low = self._value()
             self._expect("AND")
@@ -302,10 +341,12 @@ class _Text:
             self._unexpected()
         return symbol
 
-    def _value(self) -> str | float:
+    def _value(self, *, is_pattern: bool = False) -> str | float:
         kind, text = self._next()
         if kind == "text":
-            return text
+            return _unescaped(text, is_pattern=is_pattern)
+        if kind == "name":
+            self._refuse_call(text)
         if kind == "number":
             return self._reader.number(text)
         if text in ("TIMESTAMP", "DATE") and kind == "word":
@@ -313,7 +354,7 @@ class _Text:
             inner, moment = self._next()
             self._expect(")")
             if inner == "text":
-                return moment
+                return _unescaped(moment)
         self._at -= 1
         return self._unexpected()
 
@@ -351,15 +392,25 @@ def _tokens(text: str) -> list[Token]:
         if match is None or match.lastgroup is None:
             refuse_filter(f"the filter cannot be read at {text[at : at + 40]!r}", "CQL2 text")
         kind, found = match.lastgroup, match[match.lastgroup]
-        if kind == "text":
-            found = found[1:-1].replace("''", "'")
-        elif kind == "name" and found.startswith('"'):
+        if kind == "text" or (kind == "name" and found.startswith('"')):
             found = found[1:-1]
         elif kind == "name" and found.upper() in _WORDS:
             kind, found = "word", found.upper()
         tokens.append((kind, found))
         at = match.end()
     return tokens
+
+
+def _unescaped(text: str, *, is_pattern: bool = False) -> str:
+    """A text without its escapes (/req/cql2-text/escaping). In a pattern a backslash keeps the one before it."""
+
+    def one(match: re.Match[str]) -> str:
+        found = match[0][1]
+        if found == "'" or (found == "\\" and not is_pattern):
+            return found
+        return _CONTROLS.get(found, match[0])
+
+    return _ESCAPED.sub(one, text)
 
 
 class _Json:
@@ -395,8 +446,7 @@ class _Json:
     def _predicate(self, symbol: Any, arguments: list[object]) -> Condition:
         match symbol, arguments:
             case "isNull", [{"property": str(name)}]:
-                self._reader.kind_of(name)
-                return Missing(name)
+                return self._reader.missing(name)
             case "between", [{"property": str(name)}, low, high]:
                 return _between(self._reader, name, _literal(low), _literal(high))
             case "in", [{"property": str(name)}, [*values]] if values:
@@ -412,7 +462,7 @@ class _Json:
             case str(), [value, {"property": str(name)}] if symbol in COMPARISONS:
                 return self._reader.compared(name, _MIRRORED.get(symbol, symbol), _literal(value))
         return refuse_filter(
-            f"the filter has an operation that is not offered: {str(symbol)[:40]!r}",
+            f"the filter has an operation that is not offered with these arguments: {str(symbol)[:40]!r}",
             f"and, or, not, isNull, between, in, like, {', '.join(COMPARISONS)}; a property and values; "
             f"{', '.join(name.lower() for name in SPATIAL)}",
         )
@@ -427,11 +477,12 @@ class _Json:
                 refuse_filter(
                     f"{operator.lower()} has other arguments", "a property, a geometry, a distance and its unit"
                 )
+        found: shapely.Geometry | Sides
         if set(shape) == {"bbox"} and isinstance(shape["bbox"], list):
-            sides = [_literal(side) for side in shape["bbox"]]
+            sides = shape["bbox"]
             if not all(isinstance(side, int | float) and not isinstance(side, bool) for side in sides):
-                refuse_filter("a bbox in the filter holds something that is no number", "four numbers")
-            found = _box_of([self._reader.number(repr(side)) for side in sides])
+                refuse_filter("a bbox in the filter holds something that is no number", "four or six numbers")
+            found = _sides([self._reader.number(repr(side)) for side in sides])
         else:
             try:
                 found = shapely.from_geojson(orjson.dumps(shape))
@@ -440,12 +491,10 @@ class _Json:
         return self._reader.located(name, operator, found, within_m)
 
 
-def _box_of(sides: list[float]) -> shapely.Geometry:
-    if len(sides) == 6:
-        sides = [sides[0], sides[1], sides[3], sides[4]]
-    if len(sides) != 4 or not (sides[0] < sides[2] and sides[1] < sides[3]):
-        refuse_filter("a box in the filter is not one", "BBOX(west, south, east, north), west below east")
-    return shapely.box(*sides)
+def _sides(numbers: list[float]) -> Sides:
+    if len(numbers) not in (4, 6):
+        refuse_filter(f"a box in the filter has {len(numbers)} numbers", "four, or six with heights")
+    return tuple(numbers)
 
 
 def _between(reader: Reader, name: str, low: Any, high: Any) -> Condition:
@@ -456,4 +505,6 @@ def _literal(value: object) -> Any:
     match value:
         case {"timestamp": str(text)} | {"date": str(text)}:
             return text
+        case {"op": str(name), "args": _}:
+            refuse_function(name)
     return value

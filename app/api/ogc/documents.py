@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Depends
 from starlette.responses import Response
@@ -15,13 +15,15 @@ from app.api.http.routes import Router
 from app.api.ogc import pages
 from app.api.ogc.edits import READ_ONLY
 from app.api.ogc.pages import html_response
-from app.api.ogc.query import OF_ITEM, ONLY_FORMAT, PARAMETERS, list_parameters
+from app.api.ogc.query import OF_ITEM, ONLY_FORMAT, PARAMETERS, list_parameters, schema_type
 from app.api.ogc.query import described as parameters_described
 from app.api.ogc.responses import (
     GEOJSON,
     HTML,
     JSON,
+    MVT,
     OPENAPI,
+    QUERYABLES_REL,
     SCHEMA,
     BaseUrl,
     CollectionDocument,
@@ -36,10 +38,10 @@ from app.api.ogc.responses import (
     describe_read,
     link,
 )
-from app.api.ogc.tiles import TILES_REL
+from app.api.ogc.tiles import MATRIX_SET, TILES_REL
 from app.registry.conditions import GEOMETRY
 from app.registry.features import Extent, Field
-from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection, FeatureCrs
+from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection
 from app.values import JsonObject
 
 # === JSON Schemas of a collection's features: as OGC API Common part 3 (OGC 23-058r2, formerly Features part 5)
@@ -49,7 +51,6 @@ from app.values import JsonObject
 
 
 SCHEMA_REL = "http://www.opengis.net/def/rel/ogc/1.0/schema"
-QUERYABLES_REL = "http://www.opengis.net/def/rel/ogc/1.0/queryables"
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _COMMON = "http://www.opengis.net/spec/ogcapi-common-3/1.0/conf"
 _DRAFT_5 = "http://www.opengis.net/spec/ogcapi-features-5/1.0/conf"
@@ -131,11 +132,6 @@ def queryables(collection: Collection, url: str) -> dict[str, object]:
     }
 
 
-def schema_type(kind: str) -> dict[str, str]:
-    """JSON Schema of a kind of property."""
-    return {"type": "string", "format": "date-time"} if kind == "date-time" else {"type": kind}
-
-
 def _plain(collection: Collection) -> dict[str, dict[str, str]]:
     return {field.name: schema_type(field.kind) | {"title": field.text} for field in collection.fields}
 
@@ -163,12 +159,16 @@ _PROBLEM = {
 }
 
 
+_REFUSALS: dict[str, object] = {status: {"$ref": "#/components/responses/Problem"} for status in ("4XX", "5XX")}
+_PLACE_OF_TILE = {"tileMatrix": "string", "tileRow": "integer", "tileCol": "integer"}
+
+
 def api_document(base: str) -> dict[str, object]:
     """The OpenAPI document of /ogc for a server that is reached at `base`."""
     paths: dict[str, object] = {
         "/": _read("Landing page"),
         "/conformance": _read("Conformance classes"),
-        "/api": _read("This document"),
+        "/api": _read("This document", OPENAPI),
         "/collections": _read("Collections"),
     }
     for collection in COLLECTIONS.values():
@@ -197,32 +197,60 @@ def _paths(collection: Collection) -> dict[str, object]:
     items = _read(f"{name}: a page", GEOJSON, list_parameters(collection))
     item = _read(f"{name}: one", GEOJSON, OF_ITEM)
     item["parameters"] = [{"$ref": "#/components/parameters/featureId"}]
+    tile = f"{url}/tiles/{MATRIX_SET}/{{tileMatrix}}/{{tileRow}}/{{tileCol}}"
     return {
+        **({tile: _read_tile(f"{name}: a vector tile")} if collection.has_tiles else {}),
         url: _read(name),
         f"{url}/schema": _read(f"{name}: schema", SCHEMA),
-        f"{url}/geojson-schema": _read(f"{name}: schema in GeoJSON", SCHEMA),
+        f"{url}/geojson-schema": _read(f"{name}: schema in GeoJSON", SCHEMA, html=False),
         f"{url}/queryables": _read(f"{name}: what can be asked of the properties", SCHEMA),
         f"{url}/items": items,
         f"{url}/items/{{featureId}}": item,
     }
 
 
-def _read(summary: str, kind: str = JSON, parameters: tuple[str, ...] = ONLY_FORMAT) -> dict[str, object]:
+def _read(
+    summary: str, kind: str = JSON, parameters: tuple[str, ...] = ONLY_FORMAT, *, html: bool = True
+) -> dict[str, object]:
+    content: dict[str, object] = {kind: {"schema": {"type": "object"}}}
+    if html:
+        content[HTML] = {"schema": {"type": "string"}}
+    return _operation(summary, parameters, {"200": {"description": summary, "content": content}})
+
+
+def _read_tile(summary: str) -> dict[str, object]:
+    content = {MVT: {"schema": {"type": "string", "format": "binary"}}}
+    responses: dict[str, object] = {"200": {"description": summary, "content": content}}
+    responses["204"] = {"description": "No features"}
+    return _operation(summary, (*_PLACE_OF_TILE, "groups"), responses)
+
+
+def _operation(summary: str, parameters: tuple[str, ...], responses: dict[str, object]) -> dict[str, object]:
     return {
         "get": {
             "summary": summary,
             "parameters": [{"$ref": f"#/components/parameters/{name}"} for name in parameters],
-            "responses": {
-                "200": {"description": summary, "content": {kind: {"schema": {"type": "object"}}}},
-                "4XX": {"$ref": "#/components/responses/Problem"},
-            },
+            "responses": responses | _REFUSALS,
         }
     }
 
 
 def _parameters() -> dict[str, object]:
-    feature = {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}}
-    return {**{name: parameters_described(name) for name in PARAMETERS}, "featureId": feature}
+    in_path = {"featureId": "string", **_PLACE_OF_TILE}
+    return {
+        **{name: _in_openapi_3_0(parameters_described(name)) for name in PARAMETERS},
+        **{
+            name: {"name": name, "in": "path", "required": True, "schema": {"type": kind}}
+            for name, kind in in_path.items()
+        },
+    }
+
+
+def _in_openapi_3_0(parameter: dict[str, Any]) -> dict[str, Any]:
+    """A parameter whose schema has no examples: OpenAPI 3.0 has only one of them."""
+    schema = dict(parameter["schema"])
+    examples = schema.pop("examples", None)
+    return parameter | {"schema": schema | ({"example": examples[0]} if examples else {})}
 
 
 # === The documents that lead to features.
@@ -307,7 +335,10 @@ def get_api(is_page: IsApiPage, base: BaseUrl) -> Response:
 @router.get("/collections", READERS, **describe_read(Collections))
 def list_collections(is_page: IsPage, base: BaseUrl, caller: Caller, features: FeaturesService) -> Response:
     """List the collections."""
-    found = [_described(collection, features.extent(caller, collection), base) for collection in COLLECTIONS.values()]
+    found = [
+        _described(collection, features.extent(caller, collection), base, ["#/crs"])
+        for collection in COLLECTIONS.values()
+    ]
     if is_page:
         return html_response(pages.collections_page(base, found))
     document: Collections = {
@@ -316,7 +347,7 @@ def list_collections(is_page: IsPage, base: BaseUrl, caller: Caller, features: F
             link(f"{base}/collections?f=html", "alternate", HTML, "This document as HTML"),
             link(f"{base}/", "root", JSON),
         ],
-        "crs": list(FeatureCrs),
+        "crs": features.systems(caller),
         "collections": found,
     }
     return answer(document)
@@ -327,7 +358,7 @@ def get_collection(
     collection: CollectionOf, is_page: IsPage, base: BaseUrl, caller: Caller, features: FeaturesService
 ) -> Response:
     """Get a collection."""
-    document = _described(collection, features.extent(caller, collection), base)
+    document = _described(collection, features.extent(caller, collection), base, features.systems(caller))
     return html_response(pages.collection_page(base, document, collection)) if is_page else answer(document)
 
 
@@ -360,14 +391,14 @@ def get_queryables(collection: CollectionOf, is_page: IsSchemaPage, base: BaseUr
     return answer(queryables(collection, f"{base}/collections/{collection.id}/queryables"), SCHEMA)
 
 
-def _described(found: Collection, extent: Extent | None, base: str) -> CollectionDocument:
+def _described(found: Collection, extent: Extent | None, base: str, systems: list[str]) -> CollectionDocument:
     url = f"{base}/collections/{found.id}"
     described: CollectionDocument = {
         "id": found.id,
         "title": found.title,
         "description": found.text,
         "itemType": "feature",
-        "crs": list(FeatureCrs),
+        "crs": systems,
         "storageCrs": STORAGE_CRS,
         "links": [
             link(url, "self", JSON),

@@ -12,11 +12,13 @@ from app.api.http.dependencies import Caller
 from app.api.http.permissions import READERS
 from app.api.http.routes import Router
 from app.api.ogc.pages import html_response, item_page, items_page
-from app.api.ogc.query import OF_ITEM, OF_ITEMS, OF_TILE, PARAMETERS, ItemsQuery
+from app.api.ogc.query import OF_ITEM, OF_ITEMS, OF_TILE, PARAMETERS, ItemsQuery, check_listed
 from app.api.ogc.responses import (
     GEOJSON,
     HTML,
     JSON,
+    QUERYABLES_REL,
+    SCHEMA,
     BaseUrl,
     CollectionOf,
     Feature,
@@ -32,6 +34,8 @@ from app.api.ogc.responses import (
     link,
     with_query,
 )
+from app.services.access.access import Caller as CallerValue
+from app.services.markers.features import Collection, Features
 
 router = Router("/ogc/collections/{collection}/items", "ogc")
 _FILTERS = [name for name in PARAMETERS if name not in (*OF_ITEMS, *OF_TILE)]
@@ -46,11 +50,22 @@ def list_items(
 
     A page of them, or with `resultType=hits` how many there are.
     """
+    check_listed(query.systems, lambda: features.systems(caller))
+    queryables = f'<{base}/collections/{collection.id}/queryables>; rel="{QUERYABLES_REL}"; type="{SCHEMA}"'
+    response = _list_items(collection, query, base, caller, features)
+    response.headers["Link"] = queryables
+    return response
+
+
+def _list_items(
+    collection: Collection, query: ItemsQuery, base: str, caller: CallerValue, features: Features
+) -> Response:
     if query.hits:
-        hits = _hits(features.count(caller, collection, query.filtered))
+        links = _links(query, f"{base}/collections/{collection.id}", None)
+        hits = _hits(features.count(caller, collection, query.filtered), links)
         if query.is_page:
             return html_response(items_page(base, collection, query, hits, None))
-        return answer(hits, GEOJSON)
+        return answer(hits, GEOJSON, crs=query.crs)
     page = features.page(
         caller,
         collection,
@@ -85,6 +100,7 @@ def get_item(
     features: FeaturesService,
 ) -> Response:
     """Get a feature."""
+    check_listed([("crs", query.crs)], lambda: features.systems(caller))
     feature = features.get(caller, collection, feature_id, query.crs)
     url = f"{base}/collections/{collection.id}"
     document: Feature = {
@@ -104,13 +120,13 @@ def get_item(
     return answer(document, GEOJSON, crs=query.crs, headers={"ETag": f'"{version}"'} if version is not None else None)
 
 
-def _hits(matched: int) -> FeaturePage:
+def _hits(matched: int, links: list[Link]) -> FeaturePage:
     return {
         "type": "FeatureCollection",
         "timeStamp": datetime.now(UTC),
         "numberReturned": 0,
         "numberMatched": matched,
-        "links": [],
+        "links": links,
         "features": [],
     }
 

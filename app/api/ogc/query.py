@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 from typing import NamedTuple, NoReturn
 from urllib.parse import parse_qsl
 
+import numpy as np
 import shapely
 from starlette.requests import Request
 
-from app.api.ogc.cql2 import LANGUAGES, Reader
+from app.api.ogc.cql2 import LANGUAGES, Place, Placed, Reader, Sides
 from app.errors import InvalidParameter, MalformedRequest, ReferenceSystemError
 from app.geodesy import reference_system
-from app.registry.conditions import Condition
+from app.registry.conditions import Compared, Condition, Joined, Located
 from app.registry.features import FeatureFilter
-from app.registry.spatial import Area, Box
+from app.registry.spatial import Box
 from app.services.markers.features import (
     COLLECTIONS,
     EPSG_URI,
@@ -40,7 +41,18 @@ DEFAULT_HTML_LIMIT = 100
 MAX_HTML_LIMIT = 1000
 """In HTML: browsers draw all rows of a table before they show one."""
 _CRS = {"type": "string", "format": "uri", "default": STORAGE_CRS, "examples": list(FeatureCrs)}
-_NUMBERS = {"type": "array", "minItems": 4, "maxItems": 6, "items": {"type": "number"}}
+_NUMBERS = {
+    "type": "array",
+    "minItems": 4,
+    "maxItems": 6,
+    "oneOf": [{"minItems": 4, "maxItems": 4}, {"minItems": 6, "maxItems": 6}],
+    "items": {"type": "number"},
+}
+
+
+def schema_type(kind: str) -> dict[str, str]:
+    """JSON Schema of a kind of property."""
+    return {"type": "string", "format": "date-time"} if kind == "date-time" else {"type": kind}
 
 
 class Parameter(NamedTuple):
@@ -54,8 +66,7 @@ _COMMON = {
     "f": Parameter({"type": "string", "enum": ["json", "html"]}, "Format; without it the Accept header decides"),
     "crs": Parameter(
         _CRS,
-        "CRS of the response, its axes in the authority's order: one that the collection lists, or any other of the "
-        f"EPSG registry, as {EPSG_URI}25832",
+        f"CRS of the response, its axes in the authority's order: one that the collection lists, as {EPSG_URI}25832",
     ),
     "bbox": Parameter(_NUMBERS, "west,south,east,north; west is greater across the antimeridian"),
     "bbox-crs": Parameter(_CRS, "CRS of bbox"),
@@ -84,12 +95,14 @@ _FIELDS = {
     field.name: field
     for collection in reversed(COLLECTIONS.values())  # of equal names the first collection's description is kept
     for field in collection.fields
-    if field.name in collection.filters
 }
 PARAMETERS = (
     _COMMON
     | _OF_TILES
-    | {name: Parameter({"type": field.kind}, f"{field.text}: equal to this") for name, field in sorted(_FIELDS.items())}
+    | {
+        name: Parameter(schema_type(field.kind), f"{field.text}: equal to this")
+        for name, field in sorted(_FIELDS.items())
+    }
 )
 ONLY_FORMAT = ("f",)
 OF_TILE = ("f", *_OF_TILES)
@@ -99,7 +112,7 @@ OF_ITEMS = tuple(_COMMON)
 
 def list_parameters(collection: Collection) -> tuple[str, ...]:
     """Names of the parameters that a request for items of a collection may have."""
-    return (*OF_ITEMS, *collection.filters)
+    return (*OF_ITEMS, *(field.name for field in collection.fields))
 
 
 def described(name: str, formats: tuple[str, ...] = ("json", "html")) -> dict[str, object]:
@@ -121,6 +134,9 @@ def described(name: str, formats: tuple[str, ...] = ("json", "html")) -> dict[st
 
 
 _MAX_QUERY_BYTES = 8192
+_BOX_PARTS = 64
+"""Parts of the longer edges of a box in another system. Those of 100 km along a parallel at 50 degrees north are
+straight to 0.06 m."""
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?", re.ASCII)
 _TIME = re.compile(
     r"(?P<year>[0-9]{4})-(?P<month>[0-9]{2})-(?P<day>[0-9]{2})"
@@ -144,6 +160,7 @@ class ItemsQuery:
     counted: bool
     is_page: bool = False
     earlier: tuple[str, ...] = ()
+    systems: tuple[tuple[str, AnyCrs], ...] = ()  # what crs, bbox-crs and filter-crs name
 
 
 def refuse(name: str, message: str, limit: str) -> NoReturn:
@@ -203,7 +220,7 @@ def items_query(pairs: list[tuple[str, str]], collection: Collection, *, is_page
         One is unknown or cannot be.
     """
     found = _named(pairs, list_parameters(collection))
-    box, heights_m = _bbox(found)
+    box, heights_m, area = _bbox(found)
     since, until = _datetime(found["datetime"]) if "datetime" in found else (None, None)
     kind = found.get("resultType", "results")
     if kind not in ("results", "hits"):
@@ -212,6 +229,13 @@ def items_query(pairs: list[tuple[str, str]], collection: Collection, *, is_page
     if after is not None and not _ID.fullmatch(after):
         refuse("after", "after is the id of a feature", "take it from a next link")
     kinds = {field.name: field.kind for field in collection.fields}
+    asked = {name: text for name, text in found.items() if name in kinds}
+    moments = [
+        Compared(name, "=", _moment(text, last=False, name=name))
+        for name, text in asked.items()
+        if kinds[name] == "date-time"
+    ]
+    wheres = [part for part in (area, _where(found, kinds), *moments) if part is not None]
     filtered = FeatureFilter(
         table=collection.table,
         box=box,
@@ -219,9 +243,9 @@ def items_query(pairs: list[tuple[str, str]], collection: Collection, *, is_page
         since=since,
         until=until,
         equal=tuple(
-            (name, _value(name, text, kinds[name])) for name, text in found.items() if name in collection.filters
+            (name, _value(name, text, kinds[name])) for name, text in asked.items() if kinds[name] != "date-time"
         ),
-        where=_where(found, kinds),
+        where=wheres[0] if len(wheres) == 1 else Joined(True, tuple(wheres)) if wheres else None,
     )
     return ItemsQuery(
         pairs=pairs,
@@ -233,6 +257,7 @@ def items_query(pairs: list[tuple[str, str]], collection: Collection, *, is_page
         counted=flag_parameter(found, "count"),
         is_page=is_page,
         earlier=_earlier(found),
+        systems=tuple((name, crs_parameter(found, name)) for name in ("crs", "bbox-crs", "filter-crs")),
     )
 
 
@@ -256,6 +281,21 @@ def crs_parameter(found: dict[str, str], name: str) -> AnyCrs:
             refuse(name, error.message, f"geographic or projected systems, {EPSG_URI}CODE")
         return OtherCrs(sent)
     refuse(name, "this is not the URI of a CRS that is served", f"{', '.join(FeatureCrs)}, or {EPSG_URI}CODE")
+
+
+def check_listed(asked: Iterable[tuple[str, AnyCrs]], list_systems: Callable[[], list[str]]) -> None:
+    """Refuse a system that the collections do not list (18-058r1, /req/crs/fc-crs-valid-value).
+
+    Parameters
+    ----------
+    asked : iterable of (str, AnyCrs)
+        Names of parameters, and what they name.
+    list_systems : callable
+        URIs in the property crs of the collections; called only for systems that are not always in it.
+    """
+    for name, crs in asked:
+        if isinstance(crs, OtherCrs) and crs.uri not in list_systems():
+            refuse(name, f"no feature lies in the area of {crs.name}", "the systems in crs of /ogc/collections")
 
 
 def number(name: str, text: str) -> float:
@@ -322,50 +362,118 @@ def _where(found: dict[str, str], kinds: dict[str, str]) -> Condition | None:
     crs = crs_parameter(found, "filter-crs")
     if "filter" not in found:
         return None
-
-    def place(shape: shapely.Geometry, within_m: float) -> Area:
-        try:
-            return area_of_shape(in_lon_lat(shape, crs), "filter", within_m)
-        except InvalidParameter as error:
-            refuse("filter", error.message, error.limit or "points, lines and polygons")
-
     reader = Reader(
-        kinds, lambda text: _moment(text, last=False, name="filter"), lambda text: number("filter", text), place
+        kinds,
+        lambda text: _moment(text, last=False, name="filter"),
+        lambda text: number("filter", text),
+        places_in(crs),
     )
     return reader.read(found["filter"], language)
 
 
-def _bbox(found: dict[str, str]) -> tuple[Box | None, tuple[float, float] | None]:
+def places_in(crs: AnyCrs) -> Place:
+    """What turns the geometries and boxes of a filter in a CRS into areas; they are refused as the filter's."""
+
+    def place(shape: shapely.Geometry | Sides, within_m: float) -> Placed:
+        heights_m = None
+        if isinstance(shape, tuple):
+            shapes, heights_m = _sides_in_lon_lat("filter", shape, crs)
+        else:
+            shapes = _simple_parts(in_lon_lat(shape, crs))
+        try:
+            return Placed(tuple(area_of_shape(one, "filter", within_m) for one in shapes), heights_m)
+        except InvalidParameter as error:
+            refuse("filter", error.message, error.limit or "points, lines and polygons")
+
+    return place
+
+
+def _simple_parts(shape: shapely.Geometry) -> list[shapely.Geometry]:
+    if not isinstance(shape, shapely.GeometryCollection):
+        return [shape]
+    return [simple for part in shapely.get_parts(shape) for simple in _simple_parts(part) if not simple.is_empty]
+
+
+def _sides_in_lon_lat(
+    name: str, sides: Sides, crs: AnyCrs
+) -> tuple[list[shapely.Geometry], tuple[float, float] | None]:
+    """A box of four or six numbers as shapes in longitude and latitude, none over the antimeridian; and its heights."""
+    low, high, heights_m = _corners(name, sides)
+    if isinstance(crs, OtherCrs):
+        return _other_box(name, low, high, crs), heights_m
+    return [_shape_of(part) for part in _lon_lat_box(name, low, high, crs).parts], heights_m
+
+
+def _shape_of(box: Box) -> shapely.Geometry:
+    """A box; of no width or height the line or the point that it is. No edge is longer than half a turn."""
+    west, south, east, north = box.west_deg, box.south_deg, box.east_deg, box.north_deg
+    if west == east and south == north:
+        return shapely.Point(west, south)
+    if west == east or south == north:
+        return shapely.segmentize(shapely.LineString([(west, south), (east, north)]), 90.0)
+    return shapely.segmentize(shapely.box(west, south, east, north), 90.0)
+
+
+def _other_box(name: str, low: Sides, high: Sides, crs: OtherCrs) -> list[shapely.Geometry]:
+    """A box of another system: its edges are straight there, and bent in longitude and latitude."""
+    if low[0] > high[0] or low[1] > high[1]:
+        refuse(name, "a box has its upper bound below its lower one", "lower corner first")
+    width, height = high[0] - low[0], high[1] - low[1]
+    if not (width and height):
+        refuse(name, "a box has no width or no height", "lower corner, upper corner")
+    box = shapely.segmentize(shapely.box(*low, *high), max(width, height) / _BOX_PARTS)
+    turned = in_lon_lat(box, crs)
+    lon_deg = shapely.get_coordinates(turned)[:, 0]
+    if not np.isfinite(shapely.get_coordinates(turned)).all():
+        refuse(name, f"a box lies outside the area of {crs.name}", "a box in the area of its CRS")
+    if np.abs(np.diff(lon_deg)).max() <= 180.0:
+        return [turned]
+    east = shapely.transform(turned, lambda at: np.where([True, False] & (at < 0.0), at + 360.0, at))
+    halves = [shapely.clip_by_rect(east, 0, -90, 180, 90), shapely.clip_by_rect(east, 180, -90, 360, 90)]
+    back = shapely.transform(halves[1], lambda at: at - [360.0, 0.0])
+    return [half for half in (halves[0], back) if not half.is_empty]
+
+
+def _corners(name: str, sides: Sides) -> tuple[Sides, Sides, tuple[float, float] | None]:
+    """Lower and upper corner of a box of four or six numbers, and its heights."""
+    half = len(sides) // 2
+    low, high = sides[:half], sides[half:]
+    heights_m = (low[2], high[2]) if half == 3 else None
+    if heights_m is not None and heights_m[0] > heights_m[1]:
+        refuse(name, "a box has its upper height below its lower one", "lower corner first")
+    return low[:2], high[:2], heights_m
+
+
+def _bbox(found: dict[str, str]) -> tuple[Box | None, tuple[float, float] | None, Condition | None]:
+    """The box of the parameter bbox, its heights, and of other systems than WGS 84 its exact area."""
     crs = crs_parameter(found, "bbox-crs")
     text = found.get("bbox")
     if text is None:
         if "bbox-crs" in found:
             refuse("bbox-crs", "bbox-crs means nothing without bbox", "bbox with bbox-crs")
-        return None, None
-    numbers = [number("bbox", part) for part in text.split(",", 7)]
+        return None, None, None
+    numbers = tuple(number("bbox", part) for part in text.split(",", 7))
     if len(numbers) not in (4, 6):
         refuse("bbox", "bbox has four numbers, or six with heights", "west,south,east,north")
-    half = len(numbers) // 2
-    low, high = numbers[:half], numbers[half:]
-    heights_m = (low[2], high[2]) if half == 3 else None
-    if isinstance(crs, OtherCrs):
-        west, south, east, north = crs.bounds_deg((low[0], low[1]), (high[0], high[1]))
-        if not all(map(math.isfinite, (west, south, east, north))):
-            refuse("bbox", f"bbox lies outside the area of {crs.name}", "a box in the area of bbox-crs")
-    else:
-        west, south = crs.to_lon_lat(low[0], low[1])
-        east, north = crs.to_lon_lat(high[0], high[1])
-    if south > north or (heights_m is not None and heights_m[0] > heights_m[1]):
-        refuse(
-            "bbox", "bbox has its upper bound below its lower one", "lower corner first; west of east may be greater"
-        )
+    low, high, heights_m = _corners("bbox", numbers)
+    if not isinstance(crs, OtherCrs):
+        return _lon_lat_box("bbox", low, high, crs), heights_m, None
+    areas = [Located(area_of_shape(shape, "bbox")) for shape in _other_box("bbox", low, high, crs)]
+    return None, heights_m, Joined(False, tuple(areas))
+
+
+def _lon_lat_box(name: str, low: Sides, high: Sides, crs: FeatureCrs) -> Box:
+    west, south = crs.to_lon_lat(low[0], low[1])
+    east, north = crs.to_lon_lat(high[0], high[1])
+    if south > north:
+        refuse(name, "a box has its upper bound below its lower one", "lower corner first; west of east may be greater")
     if 0.0 < west - east < 360.0 - MAX_OVER_ANTIMERIDIAN_DEG:
         refuse(
-            "bbox",
-            f"bbox has its west above its east, and spans {360.0 + east - west:.6g} degrees over the antimeridian",
+            name,
+            f"a box has its west above its east, and spans {360.0 + east - west:.6g} degrees over the antimeridian",
             f"west,south,east,north; {MAX_OVER_ANTIMERIDIAN_DEG:g} degrees over the antimeridian",
         )
-    return _on_earth(west, south, east, north), heights_m
+    return _on_earth(west, south, east, north)
 
 
 def _on_earth(west: float, south: float, east: float, north: float) -> Box:

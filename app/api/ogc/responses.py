@@ -126,7 +126,7 @@ class Feature(TypedDict):
 
     type: Literal["Feature"]
     id: str
-    geometry: Geometry
+    geometry: Geometry | None  # None outside the area of the CRS
     properties: JsonObject
     links: NotRequired[list[Link]]
 
@@ -218,6 +218,7 @@ class TileMatrixSets(TypedDict):
 JSON = "application/json"
 GEOJSON = "application/geo+json"
 SCHEMA = "application/schema+json"
+QUERYABLES_REL = "http://www.opengis.net/def/rel/ogc/1.0/queryables"
 OPENAPI = "application/vnd.oai.openapi+json;version=3.0"
 HTML = "text/html"
 MVT = "application/vnd.mapbox-vector-tile"

@@ -21,12 +21,12 @@ import shapely
 import sqlalchemy as sa
 from pyproj.enums import TransformDirection
 
-from app.errors import MalformedRequest, NotFound
+from app.errors import NotFound
 from app.families import FAMILIES
 from app.formats.exports import ExportFrame, frame_records
 from app.geodesy import reference_system
 from app.geodesy.place import PLATE_FIXED_EPOCH
-from app.geodesy.systems import ELLIPSOID, best_effort, covers
+from app.geodesy.systems import ELLIPSOID, best_effort, covers, systems_of_area
 from app.registry import features as store
 from app.registry.audit import find_head
 from app.registry.conditions import GEOMETRY, holds, pinned_values
@@ -88,7 +88,7 @@ EPSG_URI = "http://www.opengis.net/def/crs/EPSG/0/"
 
 @dataclass(frozen=True, slots=True)
 class OtherCrs:
-    """Any other system of the EPSG registry, in which features are served on request."""
+    """Another system of the EPSG registry, in which features are served if its area has some."""
 
     uri: str
 
@@ -106,13 +106,6 @@ class OtherCrs:
     def is_north_first(self) -> bool:
         """Whether the authority's first axis points to the north, and the second one to the east."""
         return [axis.direction for axis in reference_system(self.name).axis_info[:2]] == ["north", "east"]
-
-    def bounds_deg(self, low: tuple[float, float], high: tuple[float, float]) -> tuple[float, float, float, float]:
-        """West, south, east and north of a box by two of its corners, to a metre."""
-        if self.is_north_first:
-            low, high = low[::-1], high[::-1]
-        west, south, east, north = best_effort(self.name).transform_bounds(*low, *high)
-        return west, south, east, north
 
 
 AnyCrs = FeatureCrs | OtherCrs
@@ -184,7 +177,6 @@ class Collection:
     geometry: str
     editable: bool = False
     fields: tuple[Field, ...] = FIELDS
-    filters: tuple[str, ...] = tuple(field.name for field in FIELDS if field.kind != "date-time")
     table: FeatureTable = ON_ROAD
     lines: LineReader | None = None
     is_audited: bool = False  # each change of them has an entry in the audit log
@@ -217,7 +209,6 @@ LINES = Collection(
     "Painted lines of magnets, and runs of CERPMs along one side of a lane, at most 100 m from one to the next.",
     "LineString",
     fields=LINE_FIELDS,
-    filters=("family", "side", "road", "status"),
     lines=MarkerLines(),
     is_audited=True,
 )
@@ -227,7 +218,6 @@ ALIGNMENTS = Collection(
     "Lanes of the alignments that plans are made for: the centre line of each, with width, speed and curvature.",
     "LineString",
     fields=LANE_FIELDS,
-    filters=("alignment_id", "alignment", "lane", "road"),
     lines=AlignmentLanes(),
 )
 PLANS = Collection(
@@ -236,7 +226,6 @@ PLANS = Collection(
     "Markers as they are placed in plans, one point each: those of plans that are not committed are in no registry.",
     "Point",
     fields=PLAN_FIELDS,
-    filters=tuple(field.name for field in PLAN_FIELDS),
     table=PLANNED,
 )
 MAINTENANCE_ITEMS = Collection(
@@ -245,7 +234,6 @@ MAINTENANCE_ITEMS = Collection(
     "Faults of markers that vehicles show, one point each, with what people decided on them.",
     "Point",
     fields=ITEM_FIELDS,
-    filters=tuple(field.name for field in ITEM_FIELDS if field.kind != "date-time"),
     table=MAINTENANCE,
 )
 LINE_SOURCES = {family.name: family.lines for family in FAMILIES if family.lines is not None}
@@ -364,7 +352,7 @@ class Features:
         Raises
         ------
         MalformedRequest
-            There is no line to go on after, or no feature of the page has a place in the CRS.
+            There is no line to go on after.
         """
         agency_id, is_first = caller.agency_id, after is None
         if collection.lines is not None:
@@ -450,6 +438,17 @@ class Features:
     def extent(self, caller: Caller, collection: Collection) -> Extent | None:
         """What the agency's features cover, as it was within the last minute."""
         return self._extents.get(caller, collection, lambda: self._find_extent(caller.agency_id, collection))
+
+    def systems(self, caller: Caller) -> list[str]:
+        """URIs of the systems that features are served in: those of WGS 84, and all whose area has some of them.
+
+        Of all collections together, because GDAL opens none if one of them does not list the system.
+        """
+        extents = {self.extent(caller, collection) for collection in COLLECTIONS.values()} - {None}
+        boxes = {(one.west_deg, one.south_deg, one.east_deg, one.north_deg) for one in extents if one is not None}
+        codes = {code for box in boxes for code in systems_of_area(*box)}
+        own = [str(crs) for crs in FeatureCrs]
+        return own + [uri for code in sorted(codes) if (uri := f"{EPSG_URI}{code}") not in own]
 
     def _find_extent(self, agency_id: str, collection: Collection) -> Extent | None:
         with self._database.read() as connection:
@@ -545,13 +544,7 @@ def _joined(features: list[str]) -> orjson.Fragment:
 
 
 def _in_crs(features: Sequence[JsonObject], crs: AnyCrs, origins: Mapping[str, MarkerOrigin]) -> list[JsonObject]:
-    """Features with their coordinates in a CRS; those that it does not reach have no geometry.
-
-    Raises
-    ------
-    MalformedRequest
-        No feature has a place in it.
-    """
+    """Features with their coordinates in a CRS; those that it does not reach have no geometry."""
     parts = [_vertices(feature) for feature in features]
     vertices = [vertex for part in parts for vertex in part]
     if isinstance(crs, OtherCrs):
@@ -592,10 +585,8 @@ def _in_other_crs(
         }  # fmt: skip
         for lon_deg, lat_deg, *up in part:
             records.append({"lon_deg": lon_deg, "lat_deg": lat_deg, "height_m": up[0] if up else None, **same})
-    framed, problem = frame_records(records, ExportFrame(crs.name, vertical_datum=ELLIPSOID, needs_heights=False))
+    framed, _ = frame_records(records, ExportFrame(crs.name, vertical_datum=ELLIPSOID, needs_heights=False))
     _place_roughly(framed, crs)
-    if problem is not None and all(record["x"] is None for record in framed):
-        raise MalformedRequest(problem.message, field="crs", limit=problem.limit, cure=problem.cure)
     order = ("y", "x") if crs.is_north_first else ("x", "y")
     return [
         None if record["x"] is None

@@ -158,9 +158,10 @@ def area_of_shape(shape: shapely.Geometry, field: str, within_m: float = 0.0) ->
     if shape.geom_type in ("Polygon", "MultiPolygon"):
         document = json.loads(shapely.to_geojson(shape))
         return area_of([document["coordinates"]] if shape.geom_type == "Polygon" else document["coordinates"], field)
-    if np.ptp(points[:, 0]) > _HALF_TURN_DEG:
-        raise _over_antimeridian(field)
     parts = [part for part in shapely.get_parts(shape) if not part.is_empty]
+    for part in parts:
+        if np.abs(np.diff(shapely.get_coordinates(part)[:, 0])).max(initial=0.0) > _HALF_TURN_DEG:
+            raise _over_antimeridian(field)
     boxes = [part.bounds for part in parts] if len(parts) <= MAX_POLYGONS else [shape.bounds]
     return Area(shapely.to_wkb(shape, byte_order=1), tuple(Box(*bounds) for bounds in boxes))
 

@@ -3801,7 +3801,7 @@ export interface components {
             severity: "refused" | "warning";
         };
         Feature: {
-            geometry: components["schemas"]["Geometry"];
+            geometry: components["schemas"]["Geometry"] | null;
             id: string;
             links?: components["schemas"]["Link"][];
             properties: {
@@ -7501,7 +7501,7 @@ export interface operations {
                 after?: string;
                 alignment?: string;
                 alignment_id?: string;
-                bbox?: number[];
+                bbox?: number[] & (unknown | unknown);
                 "bbox-crs"?: string;
                 chainage_m?: number;
                 check_points?: number;
@@ -7516,16 +7516,30 @@ export interface operations {
                 filter?: string;
                 "filter-crs"?: string;
                 "filter-lang"?: "cql2-text" | "cql2-json" | "cql-text";
+                first_at?: string;
+                from_measure_m?: number;
                 heading_deg?: number;
                 heading_rmse_deg?: number;
                 height_m?: number;
                 horizontal_rmse_m?: number;
                 instrument?: string;
                 lane?: string;
+                last_at?: string;
+                left_style?: string;
+                length_m?: number;
                 limit?: number;
                 localization_grade?: string;
+                longest_gap_m?: number;
+                marker_count?: number;
                 marker_id?: string;
+                max_curvature_per_m?: number;
+                max_grade?: number;
+                max_speed_kmh?: number;
+                max_width_m?: number;
                 measure_m?: number;
+                min_radius_m?: number;
+                min_speed_kmh?: number;
+                min_width_m?: number;
                 number?: number;
                 offset_m?: number;
                 outcome?: string;
@@ -7537,14 +7551,18 @@ export interface operations {
                 ratio?: number;
                 realization?: string;
                 resultType?: "results" | "hits";
+                right_style?: string;
                 road?: string;
                 scheme?: string;
                 side?: string;
+                spacing_m?: number;
                 station_m?: number;
                 status?: string;
                 survey_method?: string;
                 surveyor?: string;
+                to_measure_m?: number;
                 transform_accuracy_m?: number;
+                updated_at?: string;
                 vehicles?: number;
                 version?: number;
                 vertical_datum?: string;

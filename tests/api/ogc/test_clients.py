@@ -15,6 +15,7 @@ import pyogrio
 import pytest
 import shapely
 from owslib.ogcapi.features import Features
+from pyproj import Transformer
 
 from app.services.access.access import Scope
 from tests.api.ogc.test_features import ROW, add
@@ -77,6 +78,16 @@ def test_gdal_filters(gdal: Gdal) -> None:
     assert len(gdal(pyogrio.raw.read, layer="markers", bbox=(5.05, 44.0, 5.45, 46.0))[2]) == 4
     assert len(gdal(pyogrio.raw.read, layer="markers", where="road = 'A1' AND family = 'plate'")[2]) == 4
     assert len(gdal(pyogrio.raw.read, layer="markers", where="updated_at > '2020/01/01 00:00:00'")[2]) == 12
+
+
+def test_gdal_reads_a_national_system(gdal: Gdal) -> None:
+    """GDAL offers the systems that every collection lists."""
+    meta, _, geometry, _ = gdal(pyogrio.raw.read, layer="markers", CRS="EPSG:25831")
+    assert meta["crs"] == "EPSG:25831"
+    expected = Transformer.from_crs(4326, 25831, always_xy=True).transform(
+        *np.transpose(ROW[:11])
+    )  # 6 deg east ends the zone
+    np.testing.assert_allclose(shapely.get_coordinates(shapely.from_wkb(geometry)), np.transpose(expected), atol=1.0)
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857"])

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import httpx
 import pytest
 import shapely.geometry
+from pyproj import Transformer
 
 from app.api.ogc.cql2 import Reader
+from app.api.ogc.query import places_in
 from app.registry.conditions import GEOMETRY, Compared, Joined, Not, holds
 from app.registry.features import FIELDS
 from app.services.access.access import Scope
-from app.services.markers.searches import area_of_shape
+from app.services.markers.features import STORAGE_CRS
 from tests.api.ogc.test_features import ITEMS, add, get
 from tests.conftest import LiveServer
 
@@ -97,6 +98,27 @@ TEXTS = {
     "INTERSECTS(geom, POINT Z (5.2 45 7))": [2],
     "S_INTERSECTS(geometry, MULTIPOINT((5.2 45), (5.4 45), (0 0)))": [2, 4],
     "S_INTERSECTS(geometry, LINESTRING(4.95 45, 5.15 45))": [0, 1],
+    "S_INTERSECTS(geometry, GEOMETRYCOLLECTION(POINT(5.5 45), POLYGON((5 44, 5.15 44, 5.15 46, 5 46, 5 44))))": [
+        0,
+        1,
+        5,
+    ],
+    "S_DISJOINT(geom, GEOMETRYCOLLECTION(POINT Z(5.1 45 3), GEOMETRYCOLLECTION(LINESTRING(5 45, 5.1 45))))": [
+        2,
+        3,
+        4,
+        5,
+    ],
+    "S_INTERSECTS(geometry, MULTILINESTRING((-180 -45, 0 -45), (0 45, 180 45)))": [0, 1, 2, 3, 4, 5],
+    "S_INTERSECTS(geometry, BBOX(-180, -90, 180, 90))": [0, 1, 2, 3, 4, 5],
+    "S_INTERSECTS(geometry, BBOX(170, -90, -170, 90))": [],
+    "S_INTERSECTS(geometry, BBOX(5.3, 45, 5.3, 45))": [3],
+    "S_INTERSECTS(geometry, BBOX(5.05, 44, 0, 5.35, 46, 10))": [1, 2, 3],
+    "geometry IS NULL": [],
+    "geom IS NOT NULL": [0, 1, 2, 3, 4, 5],
+    r"road = 'O\'Hare *[x]'": [3],
+    r"road = '50%_\\'": [4],
+    r"road = 'A\t1' OR road LIKE 'A\n%'": [],
     "S_DWITHIN(geometry, POINT(5.2 45), 7.9, 'km')": [1, 2, 3],
     "DWITHIN(geometry, POINT(5.2 45), 7870, meters)": [2],
     "S_DWITHIN(geometry, LINESTRING(5.0 45.05, 5.1 45.05), 6000, 'm') OR road = 'a1'": [0, 1, 2],
@@ -159,6 +181,8 @@ BAD_TEXTS = (
     *("updated_at > TIMESTAMP('2020-13-01T00:00:00Z')", "lower(road) = 'a1'", "road = road", "1 = 1"),
     *("road = 'A1' OR OR road = 'x'", "NOT " * 10 + "x", "\"\" = 'x'"),
     *("S_INTERSECTS(road, POINT(0 0))", "S_INTERSECTS(geometry, geometry)", "S_INTERSECTS(geometry, POINT(0))"),
+    *("S_INTERSECTS(geometry, BBOX(5, 44, 10, 6, 46, 5))", "S_INTERSECTS(geometry, BBOX(5, 44, 6, 46, 7))"),
+    *("S_INTERSECTS(geometry, BBOX(1e6, 1e6, 2e6, 2e6))", "geometry = 'x'", "geometry BETWEEN 1 AND 2"),
     *("S_INTERSECTS(geometry, POINT(200 0))", "S_INTERSECTS(geometry, POLYGON((0 0, 1 1, 0 1, 1 0, 0 0)))"),
     *(
         "S_WITHIN(POINT(0 0), geometry)",
@@ -175,7 +199,7 @@ BAD_TEXTS = (
         "S_INTERSECTS(geometry, BBOX(5, 44, 4, 46))",
         "S_INTERSECTS(geometry, POINT EMPTY)",
     ),
-    *("S_INTERSECTS(geometry, GEOMETRYCOLLECTION(POINT(0 0)))", "S_DWITHIN(geometry, POINT(179.99 0), 9000, 'm')"),
+    *("S_WITHIN(geometry, GEOMETRYCOLLECTION(POINT(0 0)))", "S_DWITHIN(geometry, POINT(179.99 0), 9000, 'm')"),
     " OR ".join([f"S_INTERSECTS(geometry, {SQUARE})"] * 21),
     *(f"{'(' * 30}TRUE{')' * 30}", " OR ".join(["version = 1"] * 201), f"version = {'9' * 400}"),
 )
@@ -232,8 +256,7 @@ def test_patterns_are_limited_and_the_refusal_has_the_limit_and_the_cure(roads: 
 def test_values_in_hand_are_filtered_as_both_databases_do(roads: httpx.Client, expression: str) -> None:
     """Lines are put together before they are filtered, so no database does it."""
     kinds = {field.name: field.kind for field in FIELDS}
-    place = partial(area_of_shape, field="filter")
-    reader = Reader(kinds, _no_time, float, lambda shape, within_m: place(shape, within_m=within_m))
+    reader = Reader(kinds, _no_time, float, places_in(STORAGE_CRS))
     condition = reader.read(expression, "cql2-text")
     rows = get(roads, ITEMS, limit=100)["features"]
     found = [
@@ -253,6 +276,60 @@ def test_geometries_may_be_in_another_system(roads: httpx.Client, crs: str, plac
     named = {"filter": f"S_DWITHIN(geometry, POINT({place}), 30, 'm')", "filter-crs": uri}
     page = get(roads, ITEMS, **named)
     assert [round((one["geometry"]["coordinates"][0] - 5.0) * 10) for one in page["features"]] == [2]
+
+
+@pytest.mark.parametrize(
+    ("expression", "language", "name"),
+    [
+        ("CASEI(road) = 'a1'", "cql2-text", "CASEI"),
+        ("road = casei('a1')", "cql2-text", "CASEI"),
+        ("S_TOUCHES(geometry, POINT(0 0))", "cql2-text", "S_TOUCHES"),
+        ("S_INTERSECTS(ST_Buffer(geometry, 5), POINT(0 0))", "cql2-text", "ST_BUFFER"),
+        ('{"op": "=", "args": [{"property": "road"}, {"op": "casei", "args": ["a1"]}]}', "cql2-json", "CASEI"),
+    ],
+)
+def test_an_unknown_function_is_named_beside_the_known_ones(
+    roads: httpx.Client, expression: str, language: str, name: str
+) -> None:
+    response = roads.get(ITEMS, params={"filter": expression, "filter-lang": language})
+    assert response.status_code == 400
+    error = response.json()["errors"][0]
+    assert error["detail"] == f"there is no function {name}"
+    assert error["limit"] == "S_INTERSECTS, S_WITHIN, S_DISJOINT, S_DWITHIN"
+
+
+def test_boxes_with_heights_leave_out_what_is_above_and_below(client: httpx.Client) -> None:
+    low, none = add(client, 3.0, 30.0, position={"height_m": 5.0}), add(client, 3.1, 30.0)
+    high = add(client, 3.2, 30.0, position={"height_m": 50.0})
+    for box, expected in (("2, 29, 0, 4, 31, 10", [low, none]), ("2, 29, 40, 4, 31, 60", [none, high])):
+        page = get(client, ITEMS, filter=f"S_INTERSECTS(geometry, BBOX({box}))")
+        assert [one["id"] for one in page["features"]] == expected
+        sides = [float(side) for side in box.split(",")]
+        as_json = {"op": "s_intersects", "args": [{"property": "geometry"}, {"bbox": sides}]}
+        page = get(client, ITEMS, filter=json.dumps(as_json), **{"filter-lang": "cql2-json"})
+        assert [one["id"] for one in page["features"]] == expected
+        assert [one["id"] for one in get(client, ITEMS, bbox=box.replace(" ", ""))["features"]] == expected
+    for name in ("maintenance", "plans", "marker_lines"):
+        assert get(client, f"/ogc/collections/{name}/items", bbox="2,29,0,4,31,10")["features"] == []
+
+
+def test_a_box_in_another_system_has_its_edges(client: httpx.Client) -> None:
+    """Three degrees from the central meridian of UTM zone 32, north of the grid is 2.3 degrees off."""
+    inside, outside = add(client, 11.98, 50.0), add(client, 11.98, 50.4)
+    crs = "http://www.opengis.net/def/crs/EPSG/0/25832"
+    east, north = Transformer.from_crs(4326, 25832, always_xy=True).transform(11.98, 50.0)
+    sides = (
+        east - 100,
+        north - 100,
+        east + 100,
+        north + 50_000,
+    )  # the second one is 600 m to the west of the grid's north
+    assert get(client, ITEMS, filter="TRUE")["numberMatched"] == 2
+    boxed = get(client, ITEMS, bbox=",".join(map(str, sides)), **{"bbox-crs": crs})
+    assert [one["id"] for one in boxed["features"]] == [inside], outside
+    text = f"S_INTERSECTS(geometry, BBOX({', '.join(map(str, sides))}))"
+    filtered = get(client, ITEMS, filter=text, **{"filter-crs": crs})
+    assert [one["id"] for one in filtered["features"]] == [inside]
 
 
 def test_lines_are_filtered_by_their_course(roads: httpx.Client) -> None:
@@ -293,7 +370,7 @@ def test_queryables_and_conformance_say_so(roads: httpx.Client) -> None:
     assert document["properties"]["measure_m"]["type"] == "number"
     assert document["properties"]["updated_at"]["format"] == "date-time"
     asked = get(roads, "/ogc/collections/marker_lines/queryables")["properties"]
-    assert asked["count"] == {"type": "integer", "title": "Magnets or CERPMs of the line"}
+    assert asked["marker_count"] == {"type": "integer", "title": "Magnets or CERPMs of the line"}
     assert {"family", "side", "road", "status", "length_m", "longest_gap_m"} < set(asked)
     conformance = get(roads, "/ogc/conformance")["conformsTo"]
     for ending in ("conf/filter", "conf/features-filter", "conf/cql2-text", "conf/cql2-json", "conf/basic-cql2"):

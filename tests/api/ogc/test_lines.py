@@ -53,7 +53,7 @@ def test_runs_are_cut_at_gaps_sides_and_roads(client: httpx.Client) -> None:
         "side": "left",
         "road": "A7",
         "status": "planned",
-        "count": 4,
+        "marker_count": 4,
         "spacing_m": 12.0,
         "longest_gap_m": 100.0,
         "length_m": 124.0,
@@ -122,7 +122,7 @@ def test_pages_one_by_one_are_the_whole(client: httpx.Client) -> None:
         assert client.post("/v1/markers", json=body).status_code == 201
     whole = get(client, ITEMS)
     told = [
-        (line["properties"]["road"], line["properties"]["from_measure_m"], line["properties"]["count"])
+        (line["properties"]["road"], line["properties"]["from_measure_m"], line["properties"]["marker_count"])
         for line in whole["features"]
     ]
     assert told[:2] == [(None, None, 11)] * 2
@@ -160,7 +160,7 @@ def test_filter_expressions_ask_lines(client: httpx.Client) -> None:
     short = [_cerpm(client, m, road="A7") for m in (0.0, 12.0)]
     long = [_cerpm(client, m, "right", road="A8") for m in (0.0, 90.0, 180.0)]
     asked = {
-        "count > 2": {long[0]},
+        "marker_count > 2": {long[0]},
         "length_m < 100 AND road = 'A7'": {short[0]},
         "road = 'A7' AND road = 'A8'": set(),
         "road = 'A7' OR side = 'right'": {short[0], long[0]},
@@ -172,9 +172,9 @@ def test_filter_expressions_ask_lines(client: httpx.Client) -> None:
     for text, expected in asked.items():
         assert set(ids(get(client, ITEMS, filter=text))) == expected, text
         assert get(client, ITEMS, filter=text, resultType="hits")["numberMatched"] == len(expected)
-    as_json = '{"op": ">", "args": [{"property": "count"}, 2]}'
+    as_json = '{"op": ">", "args": [{"property": "marker_count"}, 2]}'
     assert ids(get(client, ITEMS, **{"filter": as_json, "filter-lang": "cql2-json"})) == [long[0]]
-    assert ids(get(client, ITEMS, filter="count > 2", road="A7")) == []
+    assert ids(get(client, ITEMS, filter="marker_count > 2", road="A7")) == []
     assert client.get(ITEMS, params={"filter": "measure_m > 2"}).status_code == 400
 
 
@@ -208,7 +208,7 @@ def test_a_painted_line_of_magnets_is_a_line(client: httpx.Client) -> None:
     magnets = response.json()["magnets"]
     (line,) = get(client, ITEMS, bbox="20.0001,39.9,20.0002,40.1", family="magnet")["features"]
     assert line["id"] == response.json()["id"]
-    assert line["properties"]["count"] == len(magnets)
+    assert line["properties"]["marker_count"] == len(magnets)
     assert line["properties"]["longest_gap_m"] <= 6.0
     ends = [(magnet["lon_deg"], magnet["lat_deg"]) for magnet in (magnets[0], magnets[-1])]
     for end, expected in zip((line["geometry"]["coordinates"][k] for k in (0, -1)), ends, strict=True):
