@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import AfterValidator, Field
 from pyproj import CRS, Transformer
-from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError
@@ -181,22 +180,12 @@ def geographic_from(name: str) -> Transformer | None:
     return Transformer.from_crs(name, system.geodetic_crs, always_xy=True) if system.is_projected else None
 
 
-MAX_SYSTEMS = 2500
-"""Systems in the list of an area; the whole of the United States has 2,046. Keeps the list under 150 kB."""
-
-
-@lru_cache(maxsize=256)
-def systems_of_area(west_deg: float, south_deg: float, east_deg: float, north_deg: float) -> tuple[int, ...]:
-    """EPSG codes of the geographic and projected systems whose area of use meets a box, or covers it if these are many.
-
-    Systems that the registry has replaced (deprecated) are left out.
-    """
+@lru_cache(maxsize=1)
+def listed_systems() -> frozenset[int]:
+    """EPSG codes of all geographic and projected systems of the registry that PROJ computes, also of replaced ones."""
     kinds = [PJType.GEOGRAPHIC_2D_CRS, PJType.PROJECTED_CRS]
-    box = AreaOfInterest(west_deg, south_deg, east_deg, north_deg)
-    found = query_crs_info("EPSG", kinds, box)
-    if len(found) > MAX_SYSTEMS:
-        found = query_crs_info("EPSG", kinds, box, contains=True)
-    return tuple(sorted(int(one.code) for one in found if one.projection_method_name not in _UNKNOWN_TO_PROJ))
+    found = query_crs_info("EPSG", kinds, allow_deprecated=True)
+    return frozenset(int(one.code) for one in found if one.projection_method_name not in _UNKNOWN_TO_PROJ)
 
 
 def wgs84_without_bound(name: str, first: float, second: float) -> tuple[float, float]:

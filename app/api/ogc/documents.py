@@ -41,7 +41,7 @@ from app.api.ogc.responses import (
 from app.api.ogc.tiles import MATRIX_SET, TILES_REL
 from app.registry.conditions import GEOMETRY
 from app.registry.features import Extent, Field
-from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection
+from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection, list_systems
 from app.values import JsonObject
 
 # === JSON Schemas of a collection's features: as OGC API Common part 3 (OGC 23-058r2, formerly Features part 5)
@@ -347,7 +347,7 @@ def list_collections(is_page: IsPage, base: BaseUrl, caller: Caller, features: F
             link(f"{base}/collections?f=html", "alternate", HTML, "This document as HTML"),
             link(f"{base}/", "root", JSON),
         ],
-        "crs": features.systems(caller),
+        "crs": list(list_systems()),
         "collections": found,
     }
     return answer(document)
@@ -358,7 +358,7 @@ def get_collection(
     collection: CollectionOf, is_page: IsPage, base: BaseUrl, caller: Caller, features: FeaturesService
 ) -> Response:
     """Get a collection."""
-    document = _described(collection, features.extent(caller, collection), base, features.systems(caller))
+    document = _described(collection, features.extent(caller, collection), base, list(list_systems()))
     return html_response(pages.collection_page(base, document, collection)) if is_page else answer(document)
 
 

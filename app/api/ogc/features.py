@@ -12,7 +12,7 @@ from app.api.http.dependencies import Caller
 from app.api.http.permissions import READERS
 from app.api.http.routes import Router
 from app.api.ogc.pages import html_response, item_page, items_page
-from app.api.ogc.query import OF_ITEM, OF_ITEMS, OF_TILE, PARAMETERS, ItemsQuery, check_listed
+from app.api.ogc.query import OF_ITEM, OF_ITEMS, OF_TILE, PARAMETERS, ItemsQuery
 from app.api.ogc.responses import (
     GEOJSON,
     HTML,
@@ -50,7 +50,6 @@ def list_items(
 
     A page of them, or with `resultType=hits` how many there are.
     """
-    check_listed(query.systems, lambda: features.systems(caller))
     queryables = f'<{base}/collections/{collection.id}/queryables>; rel="{QUERYABLES_REL}"; type="{SCHEMA}"'
     response = _list_items(collection, query, base, caller, features)
     response.headers["Link"] = queryables
@@ -100,7 +99,6 @@ def get_item(
     features: FeaturesService,
 ) -> Response:
     """Get a feature."""
-    check_listed([("crs", query.crs)], lambda: features.systems(caller))
     feature = features.get(caller, collection, feature_id, query.crs)
     url = f"{base}/collections/{collection.id}"
     document: Feature = {

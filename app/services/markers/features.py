@@ -12,6 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
+from functools import lru_cache
 from itertools import islice
 from typing import ClassVar, Generic, Protocol, TypeVar
 
@@ -26,7 +27,7 @@ from app.families import FAMILIES
 from app.formats.exports import ExportFrame, frame_records
 from app.geodesy import reference_system
 from app.geodesy.place import PLATE_FIXED_EPOCH
-from app.geodesy.systems import ELLIPSOID, best_effort, covers, systems_of_area
+from app.geodesy.systems import ELLIPSOID, best_effort, covers, listed_systems
 from app.registry import features as store
 from app.registry.audit import find_head
 from app.registry.conditions import GEOMETRY, holds, pinned_values
@@ -88,7 +89,7 @@ EPSG_URI = "http://www.opengis.net/def/crs/EPSG/0/"
 
 @dataclass(frozen=True, slots=True)
 class OtherCrs:
-    """Another system of the EPSG registry, in which features are served if its area has some."""
+    """Another system of the EPSG registry; features outside its area have no geometry in it."""
 
     uri: str
 
@@ -109,6 +110,13 @@ class OtherCrs:
 
 
 AnyCrs = FeatureCrs | OtherCrs
+
+
+@lru_cache(maxsize=1)
+def list_systems() -> tuple[str, ...]:
+    """URIs of the systems that features are served in: those of WGS 84 first."""
+    own = [str(crs) for crs in FeatureCrs]
+    return (*own, *(uri for code in sorted(listed_systems()) if (uri := f"{EPSG_URI}{code}") not in own))
 
 
 def in_lon_lat(shape: shapely.Geometry, crs: AnyCrs) -> shapely.Geometry:
@@ -438,17 +446,6 @@ class Features:
     def extent(self, caller: Caller, collection: Collection) -> Extent | None:
         """What the agency's features cover, as it was within the last minute."""
         return self._extents.get(caller, collection, lambda: self._find_extent(caller.agency_id, collection))
-
-    def systems(self, caller: Caller) -> list[str]:
-        """URIs of the systems that features are served in: those of WGS 84, and all whose area has some of them.
-
-        Of all collections together, because GDAL opens none if one of them does not list the system.
-        """
-        extents = {self.extent(caller, collection) for collection in COLLECTIONS.values()} - {None}
-        boxes = {(one.west_deg, one.south_deg, one.east_deg, one.north_deg) for one in extents if one is not None}
-        codes = {code for box in boxes for code in systems_of_area(*box)}
-        own = [str(crs) for crs in FeatureCrs]
-        return own + [uri for code in sorted(codes) if (uri := f"{EPSG_URI}{code}") not in own]
 
     def _find_extent(self, agency_id: str, collection: Collection) -> Extent | None:
         with self._database.read() as connection:

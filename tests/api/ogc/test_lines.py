@@ -73,7 +73,7 @@ def test_where_measures_repeat_there_are_two_runs(client: httpx.Client, repeated
     after = [_cerpm(client, m + 400.0 - repeated_m, along_m=400.0 + m) for m in (4.0, 16.0, 28.0, 40.0)]
     page = get(client, ITEMS)
     assert set(ids(page)) == {before[0], after[0]}
-    counts = {line_id: _line(page, line_id)["properties"]["count"] for line_id in ids(page)}
+    counts = {line_id: _line(page, line_id)["properties"]["marker_count"] for line_id in ids(page)}
     assert counts == {before[0]: 5, after[0]: 4}
     assert max(_line(page, line_id)["properties"]["longest_gap_m"] for line_id in ids(page)) == 12.0
     first = get(client, ITEMS, limit=1)
