@@ -24,7 +24,7 @@ CAMERA = {"width_px": 96, "height_px": 64, "fx_px": 80.0, "fy_px": 80.0, "cx_px"
         ({"packets": {"poses": {"columns": {"colour": "a"}}}}, "packets.poses.columns", "heading"),
         ({"frames": {"poses": {"date": "2026-13-01"}}}, "frames.poses.date", "date"),
         ({"trace": {"bar": {"sensors": [{"position_m": [0, 0, 0]}] * 3}}}, "trace.bar.positions_m", "no two alike"),
-        ({"trace": {"can": {"speed": {}}}}, "trace.can.speed", "one of both"),
+        ({"trace": {"can": {"speed": {}}}}, "trace.can.speed", "an identifier, or both"),
         ({"trace": {"can": {"speed": {"name": "v", "factor": 0}}}}, "trace.can.speed.factor", "not 0"),
         ({"trace": {"tag_formats": [{"magnets": 9}]}}, "trace.tag_formats.0.magnets", "at most 7"),
         ({"trace": {"columns": {"decimal": ","}}}, "trace.columns.delimiter", "differ"),
