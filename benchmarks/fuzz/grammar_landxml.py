@@ -31,7 +31,7 @@ _ROT_NOTE = "rot is missing or contradicts"
 _LONG_ARC_NOTE = "its PI lies behind its start"
 _PRINTED = 12.0
 """Greatest error of a place as a multiple of the last digit: Start, End and Center are each rounded, the direction of a
-chord is that of two rounded ends, and the length of an arc of 2.3 rad that only its radius shows is 6 times as coarse."""
+chord is that of two rounded ends, and the length of an arc of 2.3 rad that its radius alone shows is 6 times that."""
 
 
 @dataclass(slots=True)

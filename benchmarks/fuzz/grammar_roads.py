@@ -8,6 +8,7 @@ import numpy as np
 
 from app.formats.alignments.read import read_alignment
 from benchmarks.fuzz.grammar import Check, Grammar, Rng
+from benchmarks.fuzz.grammar_dxf import write_dxf, write_dxf_survey
 from benchmarks.fuzz.grammar_landxml import write_landxml
 
 # === OpenDRIVE: one straight road with a lane offset and widths as cubics that begin anywhere.
@@ -85,4 +86,9 @@ def _record(tag: str, s_name: str, s: float, a: float, b: float, c: float, d: fl
     return f'<{tag} {s_name}="{s!r}" a="{a!r}" b="{b!r}" c="{c!r}" d="{d!r}"/>'
 
 
-ROAD_GRAMMARS: dict[str, Grammar] = {"landxml": write_landxml, "opendrive": _xodr}
+ROAD_GRAMMARS: dict[str, Grammar] = {
+    "landxml": write_landxml,
+    "dxf": write_dxf,
+    "dxf-survey": write_dxf_survey,
+    "opendrive": _xodr,
+}
