@@ -81,7 +81,8 @@ def _between(part: Stretch, s: Floats) -> Floats:
     for values, slope in ((part.x, np.cos(part.hdg)), (part.y, np.sin(part.hdg))):
         a, b, m0, m1 = values[i], values[i + 1], slope[i] * h, slope[i + 1] * h
         places.append(a + t * (m0 + t * ((3 * (b - a) - 2 * m0 - m1) + t * (m0 + m1 - 2 * (b - a)))))
-    return np.stack([*places, np.interp(s, part.s, part.hdg), np.interp(s, part.s, part.k)])
+    d, rate = s - part.s[i], (part.k[i + 1] - part.k[i]) / h
+    return np.stack([*places, part.hdg[i] + d * (part.k[i] + d * rate / 2.0), part.k[i] + d * rate])
 
 
 def compare_plan(
