@@ -57,6 +57,11 @@ class _Section:
     late: dict[int, float] = field(default_factory=dict)  # [m] from where an outermost lane has a width
     is_linked: bool = False  # with the section before
     raised: dict[int, tuple[float, float]] = field(default_factory=dict)  # [m] heights of lanes, inner and outer
+    side: int = 0  # the only one that it has; the lanes of the other one go on
+
+    def continues(self, lane_id: int) -> bool:
+        """Whether a lane is not written, because it is that of the section before."""
+        return self.side * lane_id < 0
 
 
 @dataclass(slots=True)
@@ -330,7 +335,18 @@ def _lanes(rng: Rng, length: float, minor: int, has_borders: bool) -> tuple[dict
             if count > 1 and end - start > 20 and not has_borders and rng.random() < 0.08:
                 late[side * count] = float(rng.uniform(3, 10))
         sections.append(_Section(start, end, ids, late, bool(k and rng.random() < 0.75)))
+        if k and min(most) and rng.random() < 0.2:
+            _make_one_sided(sections[-1], sections[-2], int(rng.choice([-1, 1])))
     return lanes, sections
+
+
+def _make_one_sided(section: _Section, before: _Section, side: int) -> None:
+    """The lanes of the other side are those of the section before."""
+    section.side = side
+    section.ids = sorted(
+        [n for n in section.ids if n * side > 0] + [n for n in before.ids if n * side < 0], reverse=True
+    )
+    section.late = {n: late for n, late in section.late.items() if n * side > 0}
 
 
 def _raise_lanes(rng: Rng, lanes: dict[int, _Lane], sections: list[_Section]) -> None:
@@ -347,17 +363,22 @@ def _raise_lanes(rng: Rng, lanes: dict[int, _Lane], sections: list[_Section]) ->
 def _section(rng: Rng, road: _Road, k: int, minor: int) -> str:
     section = road.sections[k]
     before = road.sections[k - 1] if section.is_linked else None
-    after = road.sections[k + 1] if k + 1 < len(road.sections) and road.sections[k + 1].is_linked else None
     form = (k + road.id) % 3  # a link is stated by both lanes, or by one of them
     parts: dict[str, list[str]] = {"left": [], "right": []}
     for number in section.ids:
         lane = road.lanes[number]
+        if section.continues(number):
+            continue
+        last = k  # the section up to which this element describes the lane
+        while last + 1 < len(road.sections) and road.sections[last + 1].continues(number):
+            last += 1
+        after = road.sections[last + 1] if last + 1 < len(road.sections) and road.sections[last + 1].is_linked else None
         links = ""
         if before is not None and number in before.ids and road.id % 3 != 1:
             links += f'<predecessor id="{number}"/>'
         if after is not None and number in after.ids and road.id % 3 != 2:
             links += f'<successor id="{number}"/>'
-        sized = _borders(road, section, number) if road.has_borders else _widths(lane, section)
+        sized = _borders(road, section, number) if road.has_borders else _widths(lane, section, road.sections[last].end)
         inner, outer = section.raised.get(number, (0.0, 0.0))
         raised = f'<height sOffset="0" inner="{inner!r}" outer="{outer!r}"/>' if number in section.raised else ""
         direction = str(rng.choice(["", ' direction="standard"'])) if minor >= 8 else ""
@@ -370,13 +391,14 @@ def _section(rng: Rng, road: _Road, k: int, minor: int) -> str:
         )
     sides = {name: f"<{name}>{''.join(found)}</{name}>" if found else "" for name, found in parts.items()}
     centre = '<center><lane id="0" type="none" level="false"/></center>'
-    return f'<laneSection s="{section.start!r}">{sides["left"]}{centre}{sides["right"]}</laneSection>'
+    single = ' singleSide="true"' if section.side else ""
+    return f'<laneSection s="{section.start!r}"{single}>{sides["left"]}{centre}{sides["right"]}</laneSection>'
 
 
-def _widths(lane: _Lane, section: _Section) -> str:
+def _widths(lane: _Lane, section: _Section, end: float) -> str:
     """Records of a section: the one that holds at its start begins there, moved by Taylor's formula."""
     first = section.start + section.late.get(lane.id, 0.0)
-    inside = [one for one in lane.width if first < one[0] < section.end]
+    inside = [one for one in lane.width if first < one[0] < end]
     held = [one for one in lane.width if one[0] <= first][-1]
     records = [_shifted(held, first), *inside]
     return "".join(_record("width", "sOffset", (one[0] - section.start, *one[1:])) for one in records)
@@ -452,7 +474,8 @@ def _expected(road: _Road) -> list[tuple[int, float, float]]:
                 before = None
                 continue
             start = section.start + section.late.get(lane.id, 0.0)
-            if before is not None and section.is_linked and start == section.start:
+            is_joined = section.continues(lane.id) or section.is_linked
+            if before is not None and is_joined and start == section.start:
                 runs[-1][1] = section.end
             else:
                 runs.append([start, section.end])

@@ -560,3 +560,14 @@ def test_level_and_raised_lanes_are_not_on_the_inclined_road() -> None:
     assert inner.superelevation_rad[0] == pytest.approx(roll)
     assert outer.superelevation_rad[0] == 0.0
     assert file.warnings == ()
+
+
+def test_lanes_go_on_where_a_section_has_a_single_side() -> None:
+    only = '<center><lane id="0" type="none"/></center><right>{}</right>'
+    lanes = (
+        section() + f'<laneSection s="40" singleSide="true">{only.format(RIGHT + LANE.format(-2, ""))}</laneSection>'
+    )
+    lanes += section(70.0)
+    file = read_alignment(document(road(lanes=lanes)))
+    spans = [sorted(lane.station_m[[0, -1]].tolist()) for lane in file.lanes if lane.station_m is not None]
+    assert sorted(spans) == [[0, 40], [0, 70], [40, 70], [40, 70], [70, 100], [70, 100]]

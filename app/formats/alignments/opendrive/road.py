@@ -7,7 +7,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -235,7 +235,7 @@ def _sections(road: ET.Element, place: str, span: tuple[float, float], warnings:
             limit="increasing s",
             cure="sort the lane sections, and remove those that stand twice",
         )
-    found = []
+    found: list[Section] = []
     if starts and starts[0] - span[0] > GAP_WARNING_M:
         warnings.append(f"{place}: the first lane section begins at s {starts[0]:.3f} m; there are no lanes before it.")
     for element, start, stop in zip(elements, starts, [*starts, span[1]][1:], strict=True):
@@ -246,8 +246,19 @@ def _sections(road: ET.Element, place: str, span: tuple[float, float], warnings:
                 for lane in element.iterfind(f"{side}/lane")
             ]
             centre = [_lane(lane, place, start, warnings) for lane in element.iterfind("center/lane")]
-            found.append(Section(max(start, span[0]), stop, {lane.id: lane for lane in centre[:1] + lanes}))
+            section = Section(max(start, span[0]), stop, {lane.id: lane for lane in centre[:1] + lanes})
+            if found and element.get("singleSide", "false") in ("true", "1"):
+                _continue_lanes(found[-1], section)
+            found.append(section)
     return tuple(found)
+
+
+def _continue_lanes(before: Section, section: Section) -> None:
+    """Lanes of a side that a section with `singleSide` does not have go on as in the section before."""
+    sides = {lane_id > 0 for lane_id in section.lanes if lane_id}
+    for lane in [lane for lane in before.lanes.values() if lane.id and (lane.id > 0) not in sides]:
+        before.lanes[lane.id] = replace(lane, successor=lane.id)
+        section.lanes[lane.id] = replace(lane, predecessor=lane.id)
 
 
 def _lane(lane: ET.Element, place: str, start: float, warnings: list[str]) -> LaneRecord:
