@@ -23,7 +23,7 @@ _TOLERANCE_M = 1e-5
 """Greatest difference of places. [m] Numbers are written with all digits; the integrals here are good to 1e-7 m."""
 _ALONG_M = 0.008
 """Greatest difference along a paramPoly3 by arcLength. [m] Its parameter is the length only about so well."""
-_CURVATURE = 4e-5  # [1/m] of second differences of the places
+_CURVATURE = 2e-5  # [1/m] of second differences of the places
 _JUMP_M = 0.1  # [m] at which a lane is divided
 _DRIVEN = ("driving", "driving", "driving", "driving", "entry", "exit")
 _OTHER = ("shoulder", "border", "sidewalk", "none", "median", "parking")
@@ -261,24 +261,17 @@ def _cubic(rng: Rng, at: tuple[float, float, float], s: float, kind: str, length
         v[2:] = np.array([0.04 * bend, 0.001 * twist]) * length
         u[3] = -2 / 3 * v[2] ** 2 / length
     p = np.linspace(0, 1, 4001)
-    powers = p[:, None] ** np.arange(4)
-    u1, v1 = (powers[:, :3] @ (one[1:] * (1, 2, 3)) for one in (u, v))
-    u2, v2 = (powers[:, :2] @ (one[2:] * (2, 6)) for one in (u, v))
-    speed = np.hypot(u1, v1)
-    middle = (p[:-1] + p[1:])[:, None] / 2
-    halfway = np.hypot(*((middle ** np.arange(3)) @ (one[1:] * (1, 2, 3)) for one in (u, v)))
-    run = np.concatenate([[0.0], np.cumsum((speed[:-1] + 4 * halfway + speed[1:]) / 6 / 4000)])
+    halfway = (p[:-1] + p[1:]) / 2
+    speed, between = (np.hypot(*(_derivative(one, at, 1) for one in (u, v))) for at in (p, halfway))
+    run = np.concatenate([[0.0], np.cumsum((speed[:-1] + 4 * between + speed[1:]) / 6 / 4000)])
     total = length if kind == "arcLength" else float(run[-1])
     nodes = np.linspace(0, total, math.ceil(total / 0.2) + 1)
-    at_nodes = np.interp(nodes, run * (total / run[-1]), p)
+    q = np.interp(nodes, run * (total / run[-1]), p)
     x, y, hdg = at
-    local = [np.interp(at_nodes, p, powers @ one) for one in (u, v)]
-    turned = (
-        x + local[0] * math.cos(hdg) - local[1] * math.sin(hdg),
-        y + local[0] * math.sin(hdg) + local[1] * math.cos(hdg),
-    )
-    k = (u1 * v2 - v1 * u2) / speed**3
-    part = Stretch(s + nodes, *turned, hdg + np.interp(at_nodes, p, np.arctan2(v1, u1)), np.interp(at_nodes, p, k))
+    (u0, v0), (u1, v1), (u2, v2) = ([_derivative(one, q, order) for one in (u, v)] for order in range(3))
+    place = x + u0 * math.cos(hdg) - v0 * math.sin(hdg), y + u0 * math.sin(hdg) + v0 * math.cos(hdg)
+    k = (u1 * v2 - v1 * u2) / np.hypot(u1, v1) ** 3
+    part = Stretch(s + nodes, *place, hdg + np.arctan2(v1, u1), k)
     if kind == "poly3":  # across by the distance along the direction
         a, b, c, d = (float(value) / length**n for n, value in enumerate(v))
         return part, f'<poly3 a="{a!r}" b="{b!r}" c="{c!r}" d="{d!r}"/>'
@@ -290,6 +283,12 @@ def _cubic(rng: Rng, at: tuple[float, float, float], s: float, kind: str, length
     )
     stated = "" if kind == "normalized" and rng.random() < 0.1 else f' pRange="{kind}"'
     return part, f"<paramPoly3 {shown}{stated}/>"
+
+
+def _derivative(coefficients: Floats, p: Floats, order: int) -> Floats:
+    return np.asarray(
+        np.polynomial.Polynomial(coefficients).deriv(order)(p) if order else np.polyval(coefficients[::-1], p)
+    )
 
 
 def _cubics(rng: Rng, length: float, level: float, slope: float, *, is_late: bool, max_records: int = 4) -> Records:
