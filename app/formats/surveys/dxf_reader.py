@@ -203,12 +203,35 @@ def drawn_entities(
                 if kind in kinds and layer.lower() not in off:
                     yield reference, layer
                 if is_part:
+                    _check_scales(reference)
                     yield from walk(reference.virtual_entities(), layer, level + 1)
 
     for block in document.blocks:
         if not block.is_any_layout:
             _separate_arrays(block, count_in_blocks)
     return walk(document.modelspace(), None, 0)
+
+
+def _check_scales(reference: Any) -> None:
+    """Unequal scales shear the turned blocks in a block; ezdxf would turn and scale them as if they were not turned.
+
+    Raises
+    ------
+    UnreadableUpload
+        A block with unequal scales in x and y holds a reference that is turned.
+    """
+    scales = [abs(reference.dxf.get(name, 1.0)) for name in ("xscale", "yscale")]
+    if max(scales) - min(scales) <= 1e-9 * max(scales):
+        return
+    turns = [entity.dxf.get("rotation", 0.0) % 180.0 for entity in reference.block() if entity.dxftype() == "INSERT"]
+    if any(min(turn, 180.0 - turn) > 1e-9 for turn in turns):
+        raise UnreadableUpload(
+            f"the block {str(reference.dxf.name)[:80]} is scaled by {scales[0]:g} in x and {scales[1]:g} in y, and "
+            "holds blocks that are turned",
+            field="file",
+            limit="equal scales of blocks that hold turned blocks",
+            cure="explode this block reference, and export the drawing again",
+        )
 
 
 def _separate_arrays(block: Any, count: Callable[[int], None]) -> None:

@@ -253,6 +253,18 @@ def test_rows_of_a_block_are_scaled_with_the_block_that_holds_them() -> None:
     assert [ends[0][1] for ends in _centres(_read(document)).values()] == [0.0, -7.0, -14.0]
 
 
+def test_turned_blocks_in_a_block_with_unequal_scales_are_refused() -> None:
+    """They are sheared; ezdxf scales them along the wrong axis."""
+    document, space = _drawing()
+    document.blocks.new("LANE").add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    inner = document.blocks.new("LANES").add_blockref("LANE", (0, 0))
+    space.add_blockref("LANES", (0, 0), dxfattribs={"xscale": 2})
+    assert _centres(_read(document)) == {"A": [[0.0, 0.0], [180.0, 0.0]]}
+    inner.dxf.rotation = 90
+    with pytest.raises(UnreadableUpload, match="holds blocks that are turned"):
+        _read(document)
+
+
 def test_events_in_rows_and_in_mirrored_planes_are_where_they_are_drawn() -> None:
     document, space = _drawing()
     space.add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
