@@ -16,8 +16,8 @@ MAX_DEPTH = 100
 MAX_BYTES = 256 * 2**20
 MAX_ELEMENTS = 2_000_000
 """Size of a document that is kept in memory as a tree. A tree of it takes about 1 GB."""
-MAX_NUMBER = 1e9
-"""Greatest number of a road file; it keeps cubes of polynomials finite. 25 times the equator."""
+MAX_NUMBER = 1e12
+"""Greatest number of a road file; it keeps cubes of polynomials finite. 25 times the equator in millimetres."""
 
 
 _DECLARATION = re.compile(r"""\s*<\?xml\s[^>]*?\bencoding\s*=\s*["']([\w.:-]{1,40})["'][^>]*\?>""")

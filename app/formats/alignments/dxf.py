@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ from app.formats.alignments.geometry import (
     unit_length_m,
 )
 from app.formats.surveys.declaration import METRES
-from app.formats.surveys.dxf_reader import drawn_entities, hidden_layers, open_dxf, reading_dxf
+from app.formats.surveys.dxf_reader import drawn_entities, hidden_layers, insertion_point, open_dxf, reading_dxf
 from app.formats.text import count_of
 from app.values import Floats
 
@@ -172,14 +172,16 @@ def read_dxf(data: bytes, declaration: AlignmentDeclaration | None = None) -> Al
     labels: list[_Label] = []
     others: list[tuple[str, str]] = []
     hidden: set[str] = set()
+    spelled: dict[str, str] = {}
     with reading_dxf():
-        document, unit = open_dxf(data)
+        document, unit = open_dxf(data, is_declared=declaration.unit is not None)
         unit_m, notes = _unit(document, unit, declaration)
         blocks = _Blocks(unit_m or 1.0)
         for entity, layer in drawn_entities(
             document, _LINES | _LABELS | _OTHER_CURVES.keys(), blocks.is_opened, hidden
         ):
             kind, own = entity.dxftype(), _own_name(layer)
+            own = spelled.setdefault(own.lower(), own)  # the case of names of layers does not count
             if kind in _LINES:
                 paths += _paths(entity, own, unit_m or 1.0)
             elif kind in _LABELS:
@@ -189,7 +191,7 @@ def read_dxf(data: bytes, declaration: AlignmentDeclaration | None = None) -> Al
         for path in paths:
             check_vertices(path.vertices, f"layer {path.layer}")
     check_counts(len(paths) + len(labels), sum(len(path.vertices) for path in paths))
-    notes += blocks.notes()
+    notes += [*_leave_out_zero_heights(paths), *blocks.notes()]
     if hidden:
         notes.append(hidden_layers(hidden))
         if not paths:
@@ -333,9 +335,26 @@ def _label(entity: Any, layer: str) -> _Label:
         text = ""
     else:
         text = entity.plain_text() if kind == "MTEXT" else entity.dxf.text
-    place = entity.dxf.location if kind == "POINT" else entity.dxf.insert
-    point = (float(place[0]), float(place[1]), float(place[2]))
-    return _Label(layer, " ".join(str(text).split())[:120], point)
+    return _Label(layer, " ".join(str(text).split())[:120], insertion_point(entity) or (math.nan,) * 3)
+
+
+def _leave_out_zero_heights(paths: list[_Path]) -> Iterator[str]:
+    """Lines of lanes at height 0 have no heights if others have some: they are drawn in plan."""
+    of_lanes = [k for k, path in enumerate(paths) if _is_of_lanes(path.layer)]
+    flat = [k for k in of_lanes if not paths[k].vertices[:, 2].any()]
+    if not flat or len(flat) == len(of_lanes):
+        return
+    for k in flat:
+        paths[k] = replace(paths[k], vertices=paths[k].vertices * (1.0, 1.0, math.nan))
+    yield (
+        f"{count_of(len(flat), 'line')} at height 0 read without heights, because other lines have heights; the first "
+        f"is on layer {paths[flat[0]].layer}."
+    )
+
+
+def _is_of_lanes(layer: str) -> bool:
+    kind = normalize_kind(layer)
+    return kind not in EVENT_KINDS and area_kind(kind) not in AREA_KINDS
 
 
 # --- features ---------------------------------------------------------------------------------------------------------

@@ -46,11 +46,14 @@ UNITS = {
 _HEIGHT_UNITS = {"meter": 1.0, "kilometer": 1000.0, "feet": METRES["ft-intl"], "foot": METRES["ft-intl"],
                  "miles": 5280.0 * METRES["ft-intl"]}  # fmt: skip
 """Source: LandXML 1.2, elevationType. [m]"""
+_ANGLES = {"radians": 1.0, "grads": math.pi / 200.0, "decimal degrees": math.pi / 180.0}
+"""Source: LandXML 1.2, angularType; radians without one. [rad]"""
 _FEET = ("feet", "foot")  # which foot they are is that of the lengths
 _MAX_MISFIT_RATIO = 0.25  # of two misfits the smaller one decides if it is below this share of the larger one
 _MIN_MISFIT = 1e-3  # in rad, or as a share of the length; smaller ones are the rounding of coordinates
 _MISSING_M = 1.0  # [m] of a line that its profile may leave out without a warning
 _TANGENT_RAD = 0.01  # lines and curves that meet with a smaller angle are tangents
+_WIDE = math.sin(math.pi / 4.0)  # chord of an arc of 90 or 270 degrees, as a share of the diameter
 _CURE = "correct the element at this place, or export the alignment again"
 Point = tuple[float, float]
 """Easting and northing from the origin of the file. [m]"""
@@ -63,10 +66,19 @@ class _Scale:
     unit_m: float
     height_unit_m: float
     origin: tuple[float, float]  # northing and easting in the unit of the file
+    angular: str  # unit of angles, by its name in the file
     named: dict[str, set[str]]  # texts of CgPoints by name; of a name that is used twice there may be several
 
     def length(self, element: ET.Element, name: str, place: str) -> float:
         return attribute(element, name, place) * self.unit_m
+
+    def angle(self, element: ET.Element, name: str, place: str) -> float:
+        """An angle of the file. [rad]"""
+        value = attribute(element, name, place)
+        if self.angular == "decimal dd.mm.ss":  # 45.3025 is 45 degrees, 30 minutes and 25 seconds
+            minutes, seconds = divmod(round(abs(value) % 1.0 * 1e8) / 1e4, 100.0)
+            return math.radians(abs(value) // 1.0 + minutes / 60.0 + seconds / 3600.0)
+        return value * _ANGLES.get(self.angular, 1.0)
 
     def point(self, element: ET.Element, tag: str, place: str) -> Point | None:
         """A child with northing and easting, or with the name of a CgPoint; None without one."""
@@ -117,7 +129,8 @@ def read_landxml(data: bytes, declaration: AlignmentDeclaration | None = None) -
         named.setdefault(point.get("name", ""), set()).add(" ".join((point.text or "").split()))
     crs, problem = _crs(root)
     unit_m, warnings = unit_length_m(_unit(root), declaration or AlignmentDeclaration(), crs)
-    scale = _Scale(unit_m, _height_unit_m(root, unit_m), (0.0, 0.0), named)
+    angular = next((child.get("angularUnit", "") for child in root.iterfind("Units/*")), "").lower()
+    scale = _Scale(unit_m, _height_unit_m(root, unit_m), (0.0, 0.0), angular, named)
     lanes: list[LaneGeometry] = []
     stationing: dict[str, Stationing] = {}
     vertices = 0
@@ -222,6 +235,8 @@ class _Shape:
     side: int = 0  # which of them is used
     decided: bool = True  # whether the geometry shows the side, not only `rot`
     stated: bool = True  # whether there is a `rot`
+    # the side for which a PI lies ahead of the start, of two arcs about a centre that have the same PI
+    ahead: int | None = None
 
     def heading(self, side: int, at_end: bool) -> float:
         """Direction at its start or end. [rad]"""
@@ -288,6 +303,13 @@ def _choose_sides(shapes: list[_Shape], place: str, warnings: list[str]) -> None
         if not shapes[i].decided and (side := _tangent_side(shapes, i)) is not None:
             shapes[i].side, shapes[i].decided = side, True
     for i, shape in enumerate(shapes):
+        if not shape.decided and not shape.stated and shape.ahead is not None:
+            shape.side, shape.decided = shape.ahead, True
+        if not shape.decided and shape.ahead == 1:
+            warnings.append(
+                f"{shape.place}: its PI lies behind its start, and nothing but rot shows whether it is the long arc "
+                "about its Center; it is read as such. Compare the line with a map."
+            )
         if not shape.decided and not shape.stated:
             raise _wrong(f"{shape.place}: rot is missing, and nothing else shows the side of the turn", "cw or ccw")
         if shape.side and shape.stated and _tangent_side(shapes, i) == 0:
@@ -354,7 +376,11 @@ def _read_irregular(
 def _read_curve(
     element: ET.Element, start: Point, end: Point, scale: _Scale, place: str, warnings: list[str]
 ) -> _Shape:
-    """An arc through both ends: its radius is their mean distance from the centre, or stated."""
+    """An arc through both ends: its radius is their mean distance from the centre, or stated.
+
+    Radius and chord of nearly a semicircle hardly show its turn: a last digit of 1 mm is 40 cm at its apex with a
+    radius of 100 m. There, the angle about the centre counts, or the length or delta.
+    """
     centre = scale.point(element, "Center", place)
     chord = math.dist(start, end)
     first = last = 0.0
@@ -374,13 +400,20 @@ def _read_curve(
         )
     less = math.asin(min(chord / (2.0 * radius), 1.0))
     towards = math.atan2(end[1] - start[1], end[0] - start[0])
-    length = scale.length(element, "length", place) if element.get("length") else 0.0
+    stated = 0.0
+    if element.get("length"):
+        stated = scale.length(element, "length", place) / radius
+    elif element.get("delta"):
+        stated = scale.angle(element, "delta", place)
 
     def turned(sign: float) -> Piece:
-        turn = sign * (last - first) % math.tau if centre is not None else length / radius
-        half = math.pi - less if turn > math.pi else less
-        k = sign / radius
-        return Piece(place, 0.0, 2.0 * half * radius, *start, towards - sign * half, k, k)
+        turn = sign * (last - first) % math.tau if centre is not None else stated
+        half, own = math.pi - less if turn > math.pi else less, radius
+        wide = math.sin(min(turn, math.tau) / 2.0)
+        if wide > _WIDE and abs(2.0 * radius * wide - chord) <= GAP_M:
+            half, own = turn / 2.0, chord / (2.0 * wide)
+        k = sign / own
+        return Piece(place, 0.0, 2.0 * half * own, *start, towards - sign * half, k, k)
 
     return _both_sides(element, turned, end, scale, place)
 
@@ -410,18 +443,22 @@ def _read_spiral(
 def _both_sides(element: ET.Element, turned: Callable[[float], Piece], end: Point, scale: _Scale, place: str) -> _Shape:
     """A curve or spiral turned to both sides, and the side that its length or PI show.
 
-    With Start and End, the PI fixes the turn. Arcs of more than 180 degrees have it behind their start, so that only
-    the lines through it count where the length shows which of two arcs about a centre it is.
+    With Start and End, the lines through the PI fix the turn, except of two arcs about a centre, of which one has the
+    same PI behind its start; the length or delta tells these apart.
     """
     rot = element.get("rot", "").strip().lower()
     signs = (-1.0, 1.0) if rot == "cw" else (1.0, -1.0)
     shape = _Shape(place, [[(turned(sign), end)] for sign in signs], stated=rot in ("cw", "ccw"))
     if element.get("rot") and not shape.stated:
         raise _wrong(f"{place}: rot is {element.get('rot', '')[:20]!r}", "cw or ccw")
-    length = scale.length(element, "length", place) if element.get("length") else 0.0
     pi = scale.point(element, "PI", place)
-    by_length, by_pi = [], []
+    by_length, by_lines, by_pi = [], [], []
     for side, ((piece, _stop),) in enumerate(shape.sides):
+        length = 0.0
+        if element.get("length"):
+            length = scale.length(element, "length", place)
+        elif element.get("delta") and piece.k0:
+            length = scale.angle(element, "delta", place) / abs(piece.k0)
         by_length.append(abs(piece.length / length - 1.0) if length > 0.0 else 0.0)
         to_pi = [] if pi is None else [((piece.x, piece.y), pi, False), (pi, end, True)]
         angles = [
@@ -429,10 +466,12 @@ def _both_sides(element: ET.Element, turned: Callable[[float], Piece], end: Poin
             for one, two, at_end in to_pi
             if math.dist(one, two) > NO_LENGTH_M
         ]
-        by_pi.append(sum(abs(math.remainder(angle, math.pi if length > 0.0 else math.tau)) for angle in angles))
+        by_lines.append(sum(abs(math.remainder(angle, math.pi)) for angle in angles))
+        by_pi.append(sum(abs(math.remainder(angle, math.tau)) for angle in angles))
     found = _smaller(by_length)
-    if found is None and min(by_pi) < _TANGENT_RAD:
-        found = _smaller(by_pi)
+    if found is None and min(by_lines) < _TANGENT_RAD:
+        found = _smaller(by_lines)
+        shape.ahead = _smaller(by_pi) if min(by_pi) < _TANGENT_RAD else None
     shape.side, shape.decided = found or 0, found is not None
     return shape
 

@@ -38,6 +38,10 @@ def _centres(file: AlignmentFile) -> dict[str, list[list[float]]]:
     return found
 
 
+def _heights(file: AlignmentFile) -> dict[str, list[float]]:
+    return {lane.name: lane.centre[:, 2].tolist() for lane in file.lanes if lane.centre is not None}
+
+
 def _on_circle(lane: LaneGeometry, centre: tuple[float, float], radius: float) -> float:
     """Greatest distance of the vertices with curvature from a circle."""
     assert lane.centre is not None
@@ -240,6 +244,85 @@ def test_rows_of_a_block_are_lanes_beside_each_other() -> None:
     assert [ends[0][1] for ends in _centres(_read(document)).values()] == [0.0, 3.5, 7.0]
 
 
+def test_rows_of_a_block_are_scaled_with_the_block_that_holds_them() -> None:
+    document, space = _drawing()
+    document.blocks.new("LANE").add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    rows = {"row_count": 3, "row_spacing": 3.5}
+    document.blocks.new("LANES").add_blockref("LANE", (0, 0), dxfattribs=rows)
+    space.add_blockref("LANES", (0, 0), dxfattribs={"xscale": 2, "yscale": -2})
+    assert [ends[0][1] for ends in _centres(_read(document)).values()] == [0.0, -7.0, -14.0]
+
+
+def test_turned_blocks_in_a_block_with_unequal_scales_are_refused() -> None:
+    """They are sheared; ezdxf scales them along the wrong axis."""
+    document, space = _drawing()
+    document.blocks.new("LANE").add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    inner = document.blocks.new("LANES").add_blockref("LANE", (0, 0))
+    space.add_blockref("LANES", (0, 0), dxfattribs={"xscale": 2})
+    assert _centres(_read(document)) == {"A": [[0.0, 0.0], [180.0, 0.0]]}
+    inner.dxf.rotation = 90
+    with pytest.raises(UnreadableUpload, match="holds blocks that are turned"):
+        _read(document)
+
+
+def test_events_in_rows_and_in_mirrored_planes_are_where_they_are_drawn() -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    document.blocks.new("SIGN").add_circle((0, 0), 0.3)
+    rows = {"layer": "stop_line", "column_count": 2, "column_spacing": 10.0, "extrusion": (0, 0, -1)}
+    space.add_blockref("SIGN", (-30, 1), dxfattribs=rows)
+    assert [event.point for event in _read(document).events] == [(30.0, 1.0), (20.0, 1.0)]
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [{"insert": (-45, 2), "extrusion": (0, 0, -1)}, {"insert": (0, 900), "align_point": (45, 2), "halign": 1}],
+)
+def test_mirrored_and_aligned_texts_name_the_lane_beside_them(attributes: dict[str, Any]) -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    space.add_text("N7", dxfattribs={"layer": "A", **attributes})
+    assert [lane.name for lane in _read(document).lanes] == ["N7"]
+
+
+def test_the_case_of_names_of_layers_does_not_count() -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "Lane"})
+    space.add_line((90, 0), (180, 5), dxfattribs={"layer": "LANE"})
+    assert _centres(_read(document)) == {"Lane": [[0.0, 0.0], [180.0, 5.0]]}
+
+
+def test_lines_at_height_0_beside_others_with_heights_have_none() -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "A"})
+    assert _heights(_read(document)) == {"A": [0.0, 0.0]}, "a drawing in plan; build_alignment drops its heights"
+    space.add_line((0, 9, 210), (90, 9, 211), dxfattribs={"layer": "B"})
+    file = _read(document)
+    heights = _heights(file)
+    assert np.isnan(heights["A"]).all()
+    assert heights["B"] == [210, 211]
+    assert any("1 line at height 0 read without heights" in warning for warning in file.warnings)
+
+
+def test_units_that_no_survey_has_need_a_declared_one() -> None:
+    document, space = _drawing(13)
+    space.add_line((0, 0), (90, 0))
+    with pytest.raises(UnreadableUpload, match="INSUNITS is 13"):
+        _read(document)
+    assert _read(document, unit="m").unit_m == 1.0
+    document.header["$INSUNITS"] = 23
+    assert _read(document).unit_m == pytest.approx(3600 / 3937)
+
+
+def test_characters_beside_the_code_page_are_read() -> None:
+    document, space = _drawing()
+    space.add_line((0, 0), (90, 0), dxfattribs={"layer": "O_ L_ka"})
+    stream = io.StringIO()
+    document.write(stream)
+    data = stream.getvalue().replace("O_ L_ka", "O\\U+015B \\U+0141\\U+00F3dka").encode()
+    assert [lane.name for lane in read_alignment(data).lanes] == ["Oś Łódka"]
+
+
 def test_layers_of_bound_references_have_their_own_names() -> None:
     document, space = _drawing()
     block = document.blocks.new("plan")
@@ -419,7 +502,7 @@ def test_what_cannot_be_read() -> None:
     with pytest.raises(UnreadableUpload, match="DXF cannot be used"):
         read_alignment(b"0\nSECTION\n2\nENTITIES\n0\nLINE\n10\nabc\n0\nENDSEC\n0\nEOF\n")
     with pytest.raises(UnreadableUpload, match="INSUNITS"):
-        _read(_drawing(3)[0])
+        _read(_drawing(11)[0])
 
 
 def test_damaged_drawings_raise_nothing_else() -> None:

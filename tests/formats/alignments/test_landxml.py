@@ -394,6 +394,45 @@ def test_a_pi_elsewhere_decides_nothing() -> None:
     assert read_alignment(landxml(BEFORE + far)).warnings == ()
 
 
+def test_a_rounded_centre_does_not_bend_a_semicircle() -> None:
+    """Radius and chord of a semicircle hardly show its turn: 1 mm of rounding moved the apex by 40 cm."""
+    turn = math.pi - 0.02
+    end = (round(100 * math.sin(turn), 3), round(100 - 100 * math.cos(turn), 3))
+    file = read_alignment(landxml(f'<Curve rot="ccw">{ends((0, 0), end)}<Center>100.001 0.001</Center></Curve>'))
+    np.testing.assert_allclose(np.hypot(*(centre(file)[:, :2] - (0, 100)).T), 100, atol=0.003)
+    sized = landxml(f'<Curve rot="ccw" radius="100" length="{100 * turn:.3f}">{ends((0, 0), end)}</Curve>')
+    np.testing.assert_allclose(np.hypot(*(centre(read_alignment(sized))[:, :2] - (0, 100)).T), 100, atol=0.003)
+
+
+@pytest.mark.parametrize(
+    ("unit", "delta"),
+    [("", "3.5"), ("radians", "3.5"), ("grads", "222.8169"), ("decimal degrees", "200.5352"),
+     ("decimal dd.mm.ss", "200.320677")],
+)  # fmt: skip
+def test_delta_shows_an_arc_of_more_than_180_degrees(unit: str, delta: str) -> None:
+    end = (50 * math.sin(3.5), 50 - 50 * math.cos(3.5))
+    arc = f'<Curve rot="ccw" radius="50" delta="{delta}">{ends((0, 0), end)}</Curve>'
+    units = METRIC.replace('angularUnit="decimal degrees"', f'angularUnit="{unit}"' if unit else "")
+    assert stations(read_alignment(landxml(arc, units=units)))[-1] == pytest.approx(175.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_pi_behind_a_long_arc_about_a_centre_does_not_turn_it(before: bool) -> None:
+    """Both arcs about a centre have the same PI; without a length the line before shows which it is, or else rot."""
+    turn = 3.6
+    end = (100 + 80 * math.sin(turn), 80 - 80 * math.cos(turn))
+    pi = f"<PI>0 {100 + 80 * math.tan(turn / 2)!r}</PI>"
+    arc = f'<Curve rot="ccw">{ends((100, 0), end)}<Center>80 100</Center>{pi}</Curve>'
+    file = read_alignment(landxml(BEFORE * before + arc))
+    assert stations(file)[-1] == pytest.approx(100 * before + 80 * turn)
+    assert ["its PI lies behind its start" in warning for warning in file.warnings] == [True] * (not before)
+
+
+def test_millimetres_of_a_projected_system() -> None:
+    data = landxml(line((500_000_000, 5_400_000_000), (500_100_000, 5_400_000_000)))
+    assert stations(read_alignment(data.replace(b'"meter"', b'"millimeter"')))[-1] == pytest.approx(100.0)
+
+
 def test_reference_system() -> None:
     assert read_landxml(landxml(FLAT, head='<CoordinateSystem epsgCode="25832"/>')).crs == "EPSG:25832"
     unknown = read_landxml(landxml(FLAT, head='<CoordinateSystem epsgCode="99999"/>'))

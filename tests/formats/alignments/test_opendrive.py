@@ -518,3 +518,56 @@ def test_other_directions_are_reported(direction: str, warning: str) -> None:
 def test_newer_revisions_are_reported(major: str, minor: str, newer: bool) -> None:
     file = _revised(major, minor, road())
     assert [f"revision {major}.{minor} of OpenDRIVE" in warning for warning in file.warnings] == [True] * newer
+
+
+@pytest.mark.parametrize("extra", ['<userData code="a"/>', "<dataQuality/>", '<include file="b.xml"/>'])
+def test_additional_data_of_a_geometry_is_skipped(extra: str) -> None:
+    plan = f'<geometry s="0" x="0" y="0" hdg="0" length="100"><line/>{extra}</geometry>'
+    assert len(read_alignment(document(road(plan))).lanes) == 2
+
+
+def test_borders_are_the_outer_edges_of_lanes() -> None:
+    """A lane with widths beside them is measured from the border before it."""
+    edges = '<border sOffset="0" a="-3" b="-0.01" c="0" d="0"/>', '<border sOffset="0" a="-7" b="0" c="0" d="0"/>'
+    right = "".join(f'<lane id="-{n}" type="driving">{edge}</lane>' for n, edge in enumerate(edges, 1))
+    right += LANE.format(-3, "")
+    file = read_alignment(document(road(lanes=section(right=right))))
+    lanes = {lane.name: lane for lane in file.lanes}
+    for name, start, end, width in (("-1", -1.5, -2, 3), ("-2", -5, -5.5, 4), ("-3", -8.75, -8.75, 3.5)):
+        lane = lanes[f"road 7 lane {name}"]
+        assert lane.centre is not None
+        assert lane.width_m is not None
+        np.testing.assert_allclose(lane.centre[[0, -1], 1], [start, end])
+        assert lane.width_m[0] == pytest.approx(width)
+
+
+def test_level_and_raised_lanes_are_not_on_the_inclined_road() -> None:
+    """A level lane and those outside of it begin at the edge of the inclined lane before, and lie flat."""
+    roll = math.asin(0.05)
+    right = RIGHT + LANE.format(-2, '<height sOffset="0" inner="0.1" outer="0.2"/>').replace(
+        'type="driving"', 'type="driving" level="true"'
+    )
+    profile = '<elevationProfile><elevation s="0" a="100" b="0" c="0" d="0"/></elevationProfile>'
+    profile += f'<lateralProfile><superelevation s="0" a="{roll!r}" b="0" c="0" d="0"/></lateralProfile>'
+    file = read_alignment(document(road(lanes=section(right=right), extra=profile)))
+    inner, outer = (next(lane for lane in file.lanes if lane.name.endswith(f"lane -{n}")) for n in (1, 2))
+    assert inner.centre is not None
+    assert outer.centre is not None
+    assert inner.superelevation_rad is not None
+    assert outer.superelevation_rad is not None
+    np.testing.assert_allclose(inner.centre[0, 1:], [-1.75 * math.cos(roll), 100 - 1.75 * 0.05])
+    np.testing.assert_allclose(outer.centre[0, 1:], [-3.5 * math.cos(roll) - 1.75, 100 - 3.5 * 0.05 + 0.15])
+    assert inner.superelevation_rad[0] == pytest.approx(roll)
+    assert outer.superelevation_rad[0] == 0.0
+    assert file.warnings == ()
+
+
+def test_lanes_go_on_where_a_section_has_a_single_side() -> None:
+    only = '<center><lane id="0" type="none"/></center><right>{}</right>'
+    lanes = (
+        section() + f'<laneSection s="40" singleSide="true">{only.format(RIGHT + LANE.format(-2, ""))}</laneSection>'
+    )
+    lanes += section(70.0)
+    file = read_alignment(document(road(lanes=lanes)))
+    spans = [sorted(lane.station_m[[0, -1]].tolist()) for lane in file.lanes if lane.station_m is not None]
+    assert sorted(spans) == [[0, 40], [0, 70], [40, 70], [40, 70], [70, 100], [70, 100]]

@@ -15,6 +15,7 @@ from pyproj import Geod, Transformer
 
 from app.errors import UnreadableUpload, UnsupportedUpload, WaymarkError
 from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.dxf_reader import read_dxf
 from app.formats.surveys.read import read_survey
 from app.formats.surveys.table import SurveyTable
 from app.geodesy import place_positions
@@ -296,6 +297,31 @@ def test_points_in_bound_references() -> None:
     assert list(read.texts["point"]) == ["P1", "", "", "", "P3"]
     of_layer = _read(text.getvalue(), layer="host", columns={"point": "name"})
     assert of_layer.second.tolist() == pytest.approx([5427355, 5427375])
+
+
+def test_dxf_symbols_are_where_cad_draws_them() -> None:
+    """In a plane that is seen from below x is turned; a block that holds one block with points is a part, too."""
+    document = ezdxf.new("R2010", units=6)
+    space = document.modelspace()
+    document.blocks.new("NAIL").add_circle((0, 0), 0.1)
+    rows = {"layer": "nail", "extrusion": (0, 0, -1), "row_count": 2, "row_spacing": 5.0}
+    space.add_blockref("NAIL", (-456789.0, 5427345.0, -112.0), dxfattribs=rows)
+    part = document.blocks.new("points")
+    part.add_point((20.0, 0.0, 112.0))
+    part.add_point((30.0, 0.0, 112.0))
+    document.blocks.new("whole").add_blockref("points", (0.0, 1.0))
+    space.add_blockref("whole", (456000.0, 5427345.0), dxfattribs={"layer": "host"})
+    stream = io.StringIO()
+    document.write(stream)
+    table = read_dxf(stream.getvalue().encode(), None)
+    assert table.points is not None
+    assert np.stack(table.points, axis=1).tolist() == [
+        [456789.0, 5427345.0, 112.0],
+        [456789.0, 5427350.0, 112.0],
+        [456020.0, 5427346.0, 112.0],
+        [456030.0, 5427346.0, 112.0],
+    ]
+    assert table.columns[table.names.index("layer")] == ["nail", "nail", "host", "host"]
 
 
 def test_multipoints_of_geojson() -> None:

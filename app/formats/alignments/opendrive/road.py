@@ -7,7 +7,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -30,6 +30,8 @@ from app.values import Floats, Ints
 
 LANE_TYPES = frozenset({"driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"})
 """Lanes that vehicles drive on. Source: ASAM OpenDRIVE 1.8, e_laneType."""
+_ADDITIONAL = frozenset({"userData", "include", "dataQuality"})
+"""What every element may hold besides its own content. Source: ASAM OpenDRIVE 1.5 to 1.8, g_additionalData."""
 _LANE_ID = re.compile(r"-?[0-9]{1,9}")
 _SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 _STYLES = {
@@ -65,6 +67,10 @@ class LaneRecord:
     drivable: bool
     reversed: bool  # whether vehicles drive against the direction of its side of the road
     width: Cubics  # [m] in s of the road
+    border: Cubics | None  # [m] left of the reference line, of the outer edge; instead of a width
+    # whether it is not inclined with the road, and [m] how far its middle is raised above the road
+    level: bool
+    raised_m: float
     # paint of the outer border from s on: style of the line nearer to the reference line, and of the other one
     marks: list[tuple[float, tuple[BoundaryStyle, BoundaryStyle]]]
     speeds: list[tuple[float, float]]  # [m/s] limit from s on, NaN: none
@@ -172,7 +178,7 @@ def _piece(geometry: ET.Element, place: str) -> Piece | None:
     if 0.0 <= length < NO_LENGTH_M:
         return None
     base = Piece(place, s, length, x, y, math.remainder(hdg, math.tau))
-    kinds = [child for child in geometry if child.tag != "userData"]
+    kinds = [child for child in geometry if child.tag not in _ADDITIONAL]
     kind = kinds[0].tag if len(kinds) == 1 else None
     shape = kinds[0] if kinds else geometry
     if kind == "line":
@@ -229,7 +235,7 @@ def _sections(road: ET.Element, place: str, span: tuple[float, float], warnings:
             limit="increasing s",
             cure="sort the lane sections, and remove those that stand twice",
         )
-    found = []
+    found: list[Section] = []
     if starts and starts[0] - span[0] > GAP_WARNING_M:
         warnings.append(f"{place}: the first lane section begins at s {starts[0]:.3f} m; there are no lanes before it.")
     for element, start, stop in zip(elements, starts, [*starts, span[1]][1:], strict=True):
@@ -240,8 +246,19 @@ def _sections(road: ET.Element, place: str, span: tuple[float, float], warnings:
                 for lane in element.iterfind(f"{side}/lane")
             ]
             centre = [_lane(lane, place, start, warnings) for lane in element.iterfind("center/lane")]
-            found.append(Section(max(start, span[0]), stop, {lane.id: lane for lane in centre[:1] + lanes}))
+            section = Section(max(start, span[0]), stop, {lane.id: lane for lane in centre[:1] + lanes})
+            if found and element.get("singleSide", "false") in ("true", "1"):
+                _continue_lanes(found[-1], section)
+            found.append(section)
     return tuple(found)
+
+
+def _continue_lanes(before: Section, section: Section) -> None:
+    """Lanes of a side that a section with `singleSide` does not have go on as in the section before."""
+    sides = {lane_id > 0 for lane_id in section.lanes if lane_id}
+    for lane in [lane for lane in before.lanes.values() if lane.id and (lane.id > 0) not in sides]:
+        before.lanes[lane.id] = replace(lane, successor=lane.id)
+        section.lanes[lane.id] = replace(lane, predecessor=lane.id)
 
 
 def _lane(lane: ET.Element, place: str, start: float, warnings: list[str]) -> LaneRecord:
@@ -254,13 +271,19 @@ def _lane(lane: ET.Element, place: str, start: float, warnings: list[str]) -> La
         )
     drivable = lane.get("type") in LANE_TYPES and lane_id != 0
     widths = lane.findall("width")
-    if not widths and (drivable or lane.find("border") is not None):
+    borders = lane.findall("border")
+    if not widths and not borders and drivable:
         raise UnreadableUpload(
             f"{place}: the lane has no width",
             field="file",
-            limit="elements width",
-            cure="export lanes with widths; borders are not read",
+            limit="elements width or border",
+            cure="export lanes with widths",
         )
+    raised_m = [
+        (attribute(h, "inner", place, 0.0) + attribute(h, "outer", place, 0.0)) / 2.0 for h in lane.findall("height")
+    ]
+    if drivable and len(set(raised_m)) > 1:
+        warnings.append(f"{place}: its height above the road changes; it is read with the first height.")
     direction = lane.get("direction", "standard")
     if drivable and direction not in ("standard", "reversed"):
         state = "vehicles drive on it both ways" if direction == "both" else "this direction is not known"
@@ -280,6 +303,9 @@ def _lane(lane: ET.Element, place: str, start: float, warnings: list[str]) -> La
         drivable=drivable,
         reversed=direction == "reversed",
         width=_cubics(widths, place, start),
+        border=None if widths or not borders else _cubics(borders, place, start),
+        level=lane.get("level", "false") in ("true", "1"),
+        raised_m=raised_m[0] if raised_m else 0.0,
         marks=sorted(
             (
                 (start + attribute(mark, "sOffset", place, 0.0), _styles(mark.get("type", "")))
@@ -413,8 +439,11 @@ def lane_edges(
         edge = offset
         for number in sorted((number for number in section.lanes if number * sign > 0), key=abs):
             lane = section.lanes[number]
-            width = lane.width.at(s, lookup)
-            outer = (edge[0] + sign * width[0], edge[1] + sign * width[1], edge[2] + sign * width[2])
+            if lane.border is not None:
+                outer = lane.border.at(s, lookup)
+            else:
+                width = lane.width.at(s, lookup)
+                outer = (edge[0] + sign * width[0], edge[1] + sign * width[1], edge[2] + sign * width[2])
             yield lane, edge, outer
             edge = outer
 
@@ -464,7 +493,7 @@ def build_tracks(road: Road, grid: Grid, names: set[str], road_name: str) -> lis
 def _breaks(road: Road) -> tuple[Floats, Ints]:
     """Where a cubic, geometry, limit or section begins or ends, and the section of every interval between."""
     cubics = [road.offset, road.elevation, road.superelevation]
-    cubics += [lane.width for section in road.sections for lane in section.lanes.values()]
+    cubics += [lane.border or lane.width for section in road.sections for lane in section.lanes.values()]
     speeds = [s for section in road.sections for lane in section.lanes.values() for s, _ in lane.speeds]
     starts = np.concatenate([c.starts for c in cubics] + [road.curve.s, speeds, [s for s, _ in road.speeds]])
     ends = np.array([section.start for section in road.sections] + [road.sections[-1].end])
@@ -498,19 +527,28 @@ def _lane_parts(road: Road, grid: Grid) -> dict[tuple[int, int], Floats]:
         frame = Frame(*(values[rows] for values in grid.frame))
         cos = np.cos(roll)
         limit = _steps(road.speeds, lookup, np.full(len(s), np.nan))
+        hinges: dict[bool, Values] = {}  # by side: edge of the inclined road, beyond which lanes are level
         for lane, inner, outer in lane_edges(section, _cut(grid.offset, rows), s, lookup):
+            if lane.level:
+                hinges.setdefault(lane.id > 0, inner)
             if not lane.drivable:
                 continue
             middle = _middle(inner, outer)
-            t = (middle[0] * cos, middle[1] * cos, middle[2] * cos)  # widths are measured on the inclined road
+            inclined = hinges.get(lane.id > 0, middle)
+            # widths are measured on the inclined road
+            t = (
+                middle[0] - inclined[0] * (1.0 - cos),
+                middle[1] - inclined[1] * (1.0 - cos),
+                middle[2] - inclined[2] * (1.0 - cos),
+            )
             width = np.abs(outer[0] - inner[0]) * np.sign((outer[0] - inner[0]) * lane.id)
             parts[number, lane.id] = np.stack(
                 [
                     frame.x - np.sin(frame.hdg) * t[0],
                     frame.y + np.cos(frame.hdg) * t[0],
-                    grid.height[rows] + middle[0] * np.sin(roll),
+                    grid.height[rows] + inclined[0] * np.sin(roll) + lane.raised_m,
                     lane_curvature(frame, t)[1],
-                    roll,
+                    np.zeros(len(s)) if (lane.id > 0) in hinges else roll,
                     width,
                     _steps(lane.speeds, lookup, limit),
                     s,
