@@ -452,7 +452,7 @@ def _compare(file: AlignmentFile, found: Sequence[_Alignment], writer: _Writer, 
     if file.unit_m is None or abs(file.unit_m / writer.unit_m - 1) > 1e-12:
         return f"the unit is {file.unit_m} m"
     for lane, alignment in zip(file.lanes, found, strict=True):
-        stationing = file.stationing[lane.road]
+        stationing = file.stationing[alignment.name]
         if abs(stationing.start_m - alignment.start * writer.unit_m) > 1e-9:
             return f"alignment {alignment.name}: the start station is {stationing.start_m} m"
         if len(stationing.equations) != len(alignment.equations):
