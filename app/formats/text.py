@@ -266,8 +266,12 @@ def detect_dialect(header: str) -> Dialect:
 
 
 def detect_delimiter(lines: Iterable[str], candidates: Sequence[str]) -> str:
-    """The candidate that splits most of the lines into the same number of cells; `SPACES` if none occurs."""
-    filled = [line for line in lines if line.strip()]
+    """The candidate that splits most of the lines into the same number of cells; `SPACES` if none occurs.
+
+    Candidates are single characters; those in quoted cells do not count.
+    """
+    quoted = re.compile(rf'(?:^|(?<=[{re.escape("".join(candidates))}]))"(?:[^"]|"")*"')
+    filled = [quoted.sub("", line) for line in lines if line.strip()]
     best, score = SPACES, 0
     for mark in candidates:
         ((count, agreeing),) = Counter(line.count(mark) for line in filled).most_common(1) or [(0, 0)]

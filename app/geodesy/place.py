@@ -19,7 +19,14 @@ from pyproj.transformer import TransformerGroup
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.geodesy.frames import check_lon_lat
-from app.geodesy.operations import BoundedOperation, list_operations, move_to_epoch, plate_motion
+from app.geodesy.operations import (
+    BoundedOperation,
+    bounded_operations,
+    list_operations,
+    missing_operation,
+    move_to_epoch,
+    plate_motion,
+)
 from app.geodesy.systems import (
     ELLIPSOID,
     TARGET,
@@ -572,11 +579,15 @@ def _transformed(
         known = [operation for operation in operations if not operation.needs_epoch]
         operations = known or "the transformation depends on time, and the epoch of the positions is not known"
     if isinstance(operations, str):
+        grid = None if bounded_operations(source, three_d) else missing_operation(source, *place).grid
+        install = (
+            f"projsync --file {grid} --target-dir $WAYMARK_PROJ_GRIDS_DIR, and restart the server; or " if grid else ""
+        )
         raise ReferenceSystemError(
-            f"positions cannot be staked in {name}: {operations}",
+            f"positions cannot be transformed to {name}: {operations}",
             field="crs",
             limit="a transformation with a stated accuracy",
-            cure="choose a system on WGS 84 or on the road's own datum, declare the epoch, or add the grids",
+            cure=f"{install}choose a system on WGS 84 or ETRS89, or that in which they came; declare the epoch",
         )
     heights = np.where(np.isfinite(height_m), height_m, 0.0) if three_d else np.zeros_like(lon_deg)
     epochs = np.full_like(lon_deg, origin.epoch or 0.0)

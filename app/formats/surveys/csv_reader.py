@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ from app.formats.surveys.table import (
 )
 from app.formats.text import SPACES, as_utf8, detect_delimiter, repeated_names, split_rows
 from app.geodesy import reference_system
+from app.geodesy.systems import HeightSystem
 
 # === Where the rows of delimited text begin, and what their columns are: by a header, or by position.
 
@@ -291,8 +292,42 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
     if lines.comments:
         value = f"{lines.comments} lines left out"
         detected.append(Detected("comments", value, f"they begin with {' or '.join(_COMMENTS)}"))
-    return SourceTable(
+    source = SourceTable(
         "csv", header.names, table, faults=header.faults, detected=tuple(detected), has_names=not header.last_takes_rest
+    )
+    return _with_own_points(source, declaration)
+
+
+_OWN_POINTS = ("x", "y", "z_m")
+_OWN_SYSTEM = ("geometry_crs", "geometry_vertical_datum")
+
+
+def _with_own_points(source: SourceTable, declaration: ImportDeclaration) -> SourceTable:
+    """The points of a CSV that was exported with `crs` (`app.formats.exports.write_csv`): x is the easting or the
+    longitude, and the columns state the system; `lon_deg`, `lat_deg` and `height_m` are those of the registry.
+    """
+    is_declared = any(role in declaration.columns for role in (*_COORDINATES, "height")) or declaration.decimal == ","
+    if is_declared or not set(source.names).issuperset((*_OWN_POINTS, *_OWN_SYSTEM)):
+        return source
+    columns = dict(zip(source.names, source.columns, strict=True))
+    stated = [{cell for cell in columns[name] if cell} for name in _OWN_SYSTEM]
+    if any(len(values) > 1 for values in stated):
+        raise InvalidParameter(
+            f"the rows are in several systems: {', '.join(sorted(stated[0] | stated[1])[:4])}"[:200],
+            field="file",
+            limit="one CRS and one vertical datum a file",
+            cure="export with crs and vertical_datum",
+        )
+    read = [read_numbers(columns[name], name, required=name != "z_m") for name in _OWN_POINTS]
+    source.faults.add(fault for _values, faults in read for fault in faults)
+    crs, datum = (next(iter(values), None) for values in stated)
+    detected = Detected("coordinates", "the columns x, y and z_m", "the columns geometry_* state their system")
+    return replace(
+        source,
+        points=(read[0][0], read[1][0], read[2][0]),
+        crs=crs,
+        heights=HeightSystem(datum, datum, 1.0) if datum else None,
+        detected=(*source.detected, detected),
     )
 
 

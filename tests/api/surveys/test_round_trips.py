@@ -1,10 +1,11 @@
-"""Coordinates come out of the registry as they went in: 25 systems, in every format that can carry them."""
+"""Coordinates come out of the registry as they went in: 26 systems, in every format that can carry them."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import re
 import subprocess
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,6 +45,7 @@ SYSTEMS = (
     Declared("EPSG:31370"),  # Belgium
     Declared("EPSG:2056"),  # Switzerland
     Declared("EPSG:31256"),  # Austria
+    Declared("EPSG:31287"),  # Austria, one cone for the whole country
     Declared("EPSG:2180", "ETRF2000-PL", 2026.0),  # Poland
     Declared("EPSG:2178"),  # Poland, with the zone in the eastings
     Declared("EPSG:5514"),  # Czechia, axes to the south and west
@@ -272,3 +274,111 @@ def test_kml_is_in_wgs_84_and_landxml_is_projected(client: httpx.Client) -> None
     imported(client, declared, places(declared.crs), "a road")
     for kind, crs in (("kml", "EPSG:25832"), ("landxml", "EPSG:4258"), ("dxf", "EPSG:4258")):
         assert client.get(f"/v1/exports/{kind}", params={"crs": crs}).json()["field"] == "crs"
+
+
+GEOGRAPHIC = (
+    Declared("EPSG:4979", "ITRF2014", 2026.4),  # longitude, latitude and height
+    Declared("EPSG:4326", "ITRF2014", 2026.4),
+    Declared("EPSG:4258", "ETRF2000", 2026.4),
+    Declared("EPSG:7912", None, 2026.4),
+    Declared("OGC:CRS84", "ITRF2014", 2026.4),
+)
+AGAIN = ("csv", "geojson", "gpkg", "shapefile", "landxml", "dxf")
+"""Formats of exports that surveys are read in, with their heights."""
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [*GEOGRAPHIC, *(one for one in SYSTEMS if one.crs in (
+        "EPSG:25832", "EPSG:2154", "EPSG:27700", "EPSG:2056", "EPSG:31287", "EPSG:2180", "EPSG:5514", "EPSG:6539",
+        "EPSG:2992", "EPSG:6677",
+    ))],
+    ids=lambda declared: declared.crs,
+)  # fmt: skip
+def test_an_export_is_imported_again(client: httpx.Client, declared: Declared) -> None:
+    """With the same declaration: at the same place to 0.1 mm, and LandXML, which has four decimals, to 1 mm."""
+    is_projected = reference_system(declared.crs).is_projected
+    unit_m = METRES[crs_unit(reference_system(declared.crs))] if is_projected else 111_000.0
+    degrees = np.array([(8.4164123451, 49.0051, 130.0), (8.4165123, 49.00523, 131.25), (8.41663, 49.0054, 127.5)])
+    table = places(declared.crs) if is_projected else degrees
+    declaration = {
+        "family": "cerpm", "vertical_datum": "ellipsoid",
+        **{name: value for name, value in declared._asdict().items() if value is not None},
+    }  # fmt: skip
+    names = "easting,northing" if is_projected else "lon,lat"
+    lines = [f"{k},{x!r},{y!r},{z!r}" for k, (x, y, z) in enumerate(table.tolist(), 1)]
+    data = "\n".join([f"number,{names},height", *lines]).encode()
+    first = {**declaration, "columns": {"code": "number"}, "road": "survey", "height_unit": "m"}
+    answer = client.post("/v1/imports", files={"file": ("a.csv", data)}, data={"declaration": json.dumps(first)})
+    assert answer.status_code == 201, answer.text
+    for kind in AGAIN:
+        if not is_projected and kind in ("landxml", "dxf"):
+            continue
+        exported = client.get(f"/v1/exports/{kind}", params={"road": "survey", "crs": declared.crs})
+        assert exported.status_code == 200, exported.text
+        again = {**declaration, "road": kind, "columns": {"code": None, "road": None}, "duplicates": "store"}
+        if kind not in ("landxml", "dxf") and unit_m != 1.0 and is_projected:
+            again["height_unit"] = "m"
+        form = {"declaration": json.dumps(again)}
+        answer = client.post("/v1/imports", files={"file": (kind, exported.content)}, data=form)
+        assert answer.status_code == 201, f"{kind}: {answer.text}"
+        rows = csv.DictReader(
+            io.StringIO(client.get("/v1/exports/csv", params={"road": kind, "crs": declared.crs}).text)
+        )
+        found = np.array(sorted((float(row["x"]), float(row["y"]), float(row["z_m"])) for row in rows))
+        away_mm = np.abs(found - table[np.argsort(table[:, 0])]) * [unit_m * 1000, unit_m * 1000, 1000]
+        assert away_mm.max() < (LIMIT_MM if kind == "landxml" else 0.1), (kind, away_mm)
+
+
+def test_kml_is_imported_again(client: httpx.Client) -> None:
+    """In WGS 84 and without heights, also where a WGS 84 with heights is declared."""
+    declared = Declared("EPSG:4979", "ITRF2014", 2026.4)
+    data = b"number,lon,lat\n1,8.4164123451,49.0051\n2,8.4165123,49.00523\n"
+    declaration = {"family": "cerpm", **declared._asdict(), "columns": {"code": None, "road": None}, "road": "a"}
+    form = {"declaration": json.dumps(declaration)}
+    assert client.post("/v1/imports", files={"file": ("a.csv", data)}, data=form).status_code == 201
+    content = client.get("/v1/exports/kml").content
+    form = {"declaration": json.dumps({**declaration, "road": "b", "duplicates": "store"})}
+    answer = client.post("/v1/imports", files={"file": ("a.kml", content)}, data=form)
+    assert answer.status_code == 201, answer.text
+    roads = [
+        sorted((float(row["lon_deg"]), float(row["lat_deg"])) for row in csv.DictReader(io.StringIO(text)))
+        for text in (client.get("/v1/exports/csv", params={"road": road}).text for road in ("a", "b"))
+    ]
+    assert np.array(roads[0]) == pytest.approx(np.array(roads[1]), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("crs", "lon_deg", "lat_deg", "grid"),
+    [
+        ("EPSG:27700", -1.5, 52.5, "uk_os_OSTN15_NTv2_OSGBtoETRS.tif"),
+        ("EPSG:31287", 14.3, 48.2, "at_bev_AT_GIS_GRID_2021_09_28.tif"),
+        ("EPSG:5514", 15.5, 49.8, None),
+    ],
+)
+def test_a_system_without_an_accurate_transformation_is_refused_with_the_reason(
+    client: httpx.Client, crs: str, lon_deg: float, lat_deg: float, grid: str | None
+) -> None:
+    marker = {
+        "family": "cerpm", "side": "left",
+        "position": {"lon_deg": lon_deg, "lat_deg": lat_deg, "realization": "ITRF2014", "epoch": 2026.4},
+    }  # fmt: skip
+    assert client.post("/v1/markers", json=marker).status_code == 201
+    problem = client.get("/v1/exports/csv", params={"crs": crs}).json()
+    assert re.search(r"at most 0.2 m to ITRF2014 is available: '.*' states [0-9.]+ m", problem["detail"]), problem
+    assert problem["cure"].startswith(f"projsync --file {grid} " if grid else "choose a system on WGS 84"), problem
+
+
+@pytest.mark.parametrize(("crs", "lon_deg", "lat_deg"), [("EPSG:2056", 8.2, 46.9), ("EPSG:2154", 2.3, 48.8)])
+def test_a_system_is_reached_by_way_of_etrs89(client: httpx.Client, crs: str, lon_deg: float, lat_deg: float) -> None:
+    """PROJ relates LV95 and Lambert-93 to ETRS89 within 0.1 m, and ETRS89 to ITRF2014 within 0.1 m."""
+    position = {"lon_deg": lon_deg, "lat_deg": lat_deg, "realization": "ITRF2014", "epoch": 2026.4}
+    marker = {"family": "cerpm", "side": "left", "position": position}
+    assert client.post("/v1/markers", json=marker).status_code == 201
+    answer = client.get("/v1/exports/csv", params={"crs": crs})
+    row = next(csv.DictReader(io.StringIO(answer.text)))
+    etrf = Transformer.from_crs("EPSG:9000", "EPSG:9069", always_xy=True)  # ETRF2014
+    base = Transformer.from_crs("EPSG:4258", CRS(crs).geodetic_crs, always_xy=True, allow_ballpark=False)
+    project = Transformer.from_crs(CRS(crs).geodetic_crs, crs, always_xy=True)
+    expected = project.transform(*base.transform(*etrf.transform(lon_deg, lat_deg, 0.0, 2026.4)[:2]))
+    assert (float(row["x"]), float(row["y"])) == pytest.approx(expected, abs=0.1)
