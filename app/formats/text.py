@@ -270,8 +270,10 @@ def detect_delimiter(lines: Iterable[str], candidates: Sequence[str]) -> str:
 
     Candidates are single characters; those in quoted cells do not count.
     """
-    quoted = re.compile(rf'(?:^|(?<=[{re.escape("".join(candidates))}]))"(?:[^"]|"")*"')
-    filled = [quoted.sub("", line) for line in lines if line.strip()]
+    marks = re.escape("".join(candidates))
+    quoted = re.compile(rf'(?:^|(?<=[{marks}]))"(?:[^"]|"")*"(?=[{marks}]|[ \r]*$)', re.MULTILINE)
+    text = quoted.sub("q", "\n".join(line.rstrip("\r\n") for line in lines))
+    filled = [line for line in text.split("\n") if line.strip()]
     best, score = SPACES, 0
     for mark in candidates:
         ((count, agreeing),) = Counter(line.count(mark) for line in filled).most_common(1) or [(0, 0)]

@@ -52,5 +52,6 @@ def list_grammars() -> dict[str, Grammar]:
     """All of them by name."""
     from benchmarks.fuzz.grammar_logs import LOG_GRAMMARS
     from benchmarks.fuzz.grammar_roads import ROAD_GRAMMARS
+    from benchmarks.fuzz.grammar_surveys import SURVEY_GRAMMARS
 
-    return LOG_GRAMMARS | ROAD_GRAMMARS
+    return LOG_GRAMMARS | ROAD_GRAMMARS | SURVEY_GRAMMARS

@@ -34,7 +34,10 @@ from app.geodesy.systems import HeightSystem
 
 _NUMERIC = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*")
 _MAX_NUMBER = 40  # [character] longest cell that is a number; a float64 needs 24
-_UNIT = re.compile(r"\s*[\[(]?(?:m|metres?|meters?|ft|us-?ft|usft|sft|feet|deg|degrees|°)[\])]?\s*", re.IGNORECASE)
+_UNIT = re.compile(
+    r"\s*[\[(]?(?:m|metres?|meters?|ft|us-?ft|usft|sft|ftus|ift|feet|foot|mm|cm|km|deg|degrees|°)[\])]?\s*",
+    re.IGNORECASE,
+)
 _MIN_SHARE = 0.9  # [1] of the first rows that must be numbers, or lie in the area of use
 _MIN_ROWS = 2  # columns cannot be identified by the position of one row alone
 _COORDINATES = ("lon_deg", "lat_deg", "easting", "northing")
@@ -48,6 +51,7 @@ class Header:
     start: int  # index of the first row of data
     last_takes_rest: bool = False  # whether further cells of a row belong to the last column, a description
     min_width: int = 0  # cells that a row of such a table must have
+    units: tuple[str, ...] = ()  # of a row of units, one a name
     detected: list[Detected] = field(default_factory=list)
     faults: Faults = field(default_factory=Faults)
 
@@ -121,7 +125,8 @@ def _named(rows: Sequence[Sequence[str]], names: Sequence[str], index: int) -> H
         header.names = header.names[:width]
     if header.start < len(rows) and sum(1 for cell in rows[header.start] if _UNIT.fullmatch(cell)) >= 2:
         header.start += 1
-        cells = " ".join(cell.strip() for cell in rows[header.start - 1] if cell.strip())
+        header.units = tuple(cell.strip() for cell in rows[header.start - 1])
+        cells = " ".join(filter(None, header.units))
         header.detected.append(Detected("row of units", cells[:60], "it follows the header and is not a row of data"))
     return header
 
@@ -229,7 +234,7 @@ _COMMENTS = ("#", "//")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|//)", re.MULTILINE)
 _SAMPLE_LINES = 50  # lines by which the delimiter and the header are detected
 _BATCH = 10_000  # rows at a time
-_DECIMAL_COMMAS = re.compile(r"(?:\S+[ \t]+)?[+-]?[0-9]+,[0-9]+[ \t]+[+-]?[0-9]+,[0-9]+(?:[ \t].*)?\s*")
+_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]['\u20190-9]*,[0-9]+")  # also with apostrophes between groups of digits
 
 
 class _Lines:
@@ -293,8 +298,9 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
         value = f"{lines.comments} lines left out"
         detected.append(Detected("comments", value, f"they begin with {' or '.join(_COMMENTS)}"))
     source = SourceTable(
-        "csv", header.names, table, faults=header.faults, detected=tuple(detected), has_names=not header.last_takes_rest
-    )
+        "csv", header.names, table, faults=header.faults, detected=tuple(detected),
+        has_names=not header.last_takes_rest, units=header.units,
+    )  # fmt: skip
     return _with_own_points(source, declaration)
 
 
@@ -336,10 +342,18 @@ def _detect_delimiter(utf8: bytes, declaration: ImportDeclaration) -> str:
     sample = list(islice(_Lines(utf8, keep_ends=False), _SAMPLE_LINES))
     found = detect_delimiter(sample, _DELIMITERS)
     if found == "," and declaration.decimal != ".":
-        spaced = sum(1 for line in sample if _DECIMAL_COMMAS.fullmatch(line))
-        if 2 * spaced > len(sample):
+        filled = [line for line in sample if line.strip()]
+        if 2 * sum(map(_has_decimal_commas, filled)) > len(filled):
             return SPACES
     return found
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Whether a line has two numbers with decimal commas between blanks, and no other commas before the last one."""
+    words = line.split()
+    numbers = [_DECIMAL_COMMA.fullmatch(word) is not None for word in words]
+    last = max((k for k, is_number in enumerate(numbers) if is_number), default=0)
+    return sum(numbers) >= 2 and all(numbers[k] or "," not in word for k, word in enumerate(words[:last]))
 
 
 def _check_names(names: tuple[str, ...]) -> None:

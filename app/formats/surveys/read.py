@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import chain, islice
@@ -70,7 +71,7 @@ def read_geojson(data: bytes) -> SourceTable:
         It is no JSON, no FeatureCollection, or has too many features or names.
     """
     try:
-        document = orjson.loads(data)
+        document = orjson.loads(data.removeprefix(BOM_UTF8))  # RFC 8259, section 8.1: it may be there
     except (orjson.JSONDecodeError, RecursionError) as error:
         raise UnreadableUpload(f"not JSON: {error}", field="file", limit="RFC 8259", cure=_CURE) from error
     features = document.get("features") if isinstance(document, dict) else None
@@ -279,7 +280,12 @@ _DOCUMENTS = (
     (b"LASF", "a point cloud", "export the points of the markers alone"),
 )
 """First bytes of files that are sent by mistake, their kind, and how a survey is made of it."""
-_UNIT_ENDINGS = (("_usft", "ft-us"), ("_ftus", "ft-us"), ("_ft", "ft-intl or ft-us"), ("(ft)", "ft-intl or ft-us"))
+_UNIT_ENDING = re.compile(
+    r"(?:^|_|\s*[\[(]\s*)(?:(?P<us>us[-_ ]?s?(?:urvey[-_ ]?)?(?:ft|feet|foot)|sft|ft[-_ ]?us)"
+    r"|(?P<intl>ift|ft[-_ ]?intl)|(?P<ft>ft|feet|foot)|(?P<m>m|met(?:re|er)s?)|(?P<other>mm|cm|km))\s*[\])]?$"
+)
+_MAX_NAME = 100  # [character] of a name that are looked at
+_UNITS_NAMED = {"us": "ft-us", "intl": "ft-intl", "ft": "ft-intl or ft-us", "m": "m"}
 
 
 def read_survey(data: bytes, declaration: ImportDeclaration, code_form: CodeForm | None = None) -> SurveyTable:
@@ -502,15 +508,16 @@ def _unit_names(
     faults = []
     for role, unit_used in (("easting", unit), ("northing", unit), ("height", height_unit)):
         column = places[role] if unit_used != "deg" and (has_height or role != "height") else None
-        name = source.names[column].lower().replace(" ", "_") if column is not None else ""
-        named = next((feet for ending, feet in _UNIT_ENDINGS if name.endswith(ending)), None)
-        if named is None and name.endswith(("_m", "(m)")):
-            named = "m"
+        name = source.names[column].strip() if column is not None else ""
+        below = source.units[column] if column is not None and column < len(source.units) else ""
+        found = _UNIT_ENDING.search(below.lower()) or (_UNIT_ENDING.search(name.lower()[:_MAX_NAME]) if name else None)
+        named = _UNITS_NAMED.get(found.lastgroup or "", found[found.lastgroup or 0]) if found else None
         if named is not None and unit_used not in named.split(" or "):
             message = f"the column {name} is named in {named}, its values are read as {unit_used}"
             member = "height_unit" if role == "height" else "unit"
             changes = (Change(member, named),) if named in METRES else ()
-            cure = f"declare unit or height_unit {named}"
+            is_known = not set(named.split(" or ")).isdisjoint(METRES)
+            cure = f"declare {member} {named}" if is_known else f"write the column in {', '.join(METRES)}"
             faults.append(Fault(None, role, "unit_in_header", message, cure, Severity.REFUSED, changes))
     return faults
 

@@ -198,6 +198,7 @@ class SourceTable:
     detected: tuple[Detected, ...] = ()
     has_names: bool = True  # whether the names are the file's own; those of a layout by position are not
     heights: HeightSystem | None = None  # what the heights are above, where the file's CRS states it
+    units: tuple[str, ...] = ()  # one a name, where a row of units follows the header
 
     @property
     def rows(self) -> int:
