@@ -267,8 +267,14 @@ def detect_dialect(header: str) -> Dialect:
 
 
 def detect_delimiter(lines: Iterable[str], candidates: Sequence[str]) -> str:
-    """The candidate that splits most of the lines into the same number of cells; `SPACES` if none occurs."""
-    filled = [line for line in lines if line.strip()]
+    """The candidate that splits most of the lines into the same number of cells; `SPACES` if none occurs.
+
+    Candidates are single characters; those in quoted cells do not count.
+    """
+    marks = re.escape("".join(candidates))
+    quoted = re.compile(rf'(?:^|(?<=[{marks}]))"(?:[^"]|"")*"(?=[{marks}]|[ \r]*$)', re.MULTILINE)
+    text = quoted.sub("q", "\n".join(line.rstrip("\r\n") for line in lines))
+    filled = [line for line in text.split("\n") if line.strip()]
     best, score = SPACES, 0
     for mark in candidates:
         ((count, agreeing),) = Counter(line.count(mark) for line in filled).most_common(1) or [(0, 0)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import warnings
@@ -9,8 +10,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib import resources
+from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,10 @@ from app.geodesy.systems import best_effort, covers, named_system
 from app.values import Floats
 
 _ITRF2014_2D, _ITRF2014_3D = "EPSG:9000", "EPSG:7912"
+_ETRS89_2D, _ETRS89_3D = "EPSG:4258", "EPSG:4937"
+MAX_BY_ETRS89_M = 0.2
+"""Worst accuracy of a transformation by way of ETRS89: 0.1 m of ETRS89 without a realization and at most 0.17 m of the
+national system. [m] The seven parameters of a country state 0.5 m to 2 m."""
 _TIMELY = ("t_epoch", "defmodel")
 _MAX_NAME = 200  # characters; a note has 500
 
@@ -34,10 +40,11 @@ class BoundedOperation:
     bound_m: float  # [m] its stated accuracy
     name: str  # its name in PROJ
     needs_epoch: bool  # whether it depends on time: PROJ assumes an epoch if there is none
+    areas: tuple[Any, ...]  # areas of use of its steps
 
     def covers(self, lon_deg: npt.NDArray[np.float64], lat_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
         """Which places are in its area of use, where its stated accuracy holds."""
-        return covers(self.transformer.area_of_use, lon_deg, lat_deg)
+        return np.asarray(np.all([covers(area, lon_deg, lat_deg) for area in self.areas], axis=0))
 
 
 @lru_cache(maxsize=256)
@@ -45,29 +52,105 @@ def bounded_operations(name: str, three_d: bool) -> tuple[BoundedOperation, ...]
     """Operations from a system's longitudes and latitudes to ITRF2014 that can be run here and state an accuracy.
 
     The most accurate comes first. From a projected system PROJ does not find operations with an intermediate system: it
-    finds none from ETRS89 / UTM zone 32N, but four from ETRS89.
+    finds none from ETRS89 / UTM zone 32N, but four from ETRS89. National systems that it relates to ETRS89 alone, such
+    as CH1903+, are transformed by way of ETRS89, with the root of the sum of the squares of both accuracies, if that is
+    at most `MAX_BY_ETRS89_M`.
     """
-    target = _ITRF2014_3D if three_d else _ITRF2014_2D
+    found = _operations_between(name, _ITRF2014_3D if three_d else _ITRF2014_2D, three_d)
+    if not found and named_system(name).geodetic_crs != named_system(_ETRS89_2D):
+        found = [
+            _chained(first, second)
+            for first in _operations_between(name, _ETRS89_3D if three_d else _ETRS89_2D, three_d)
+            for second in bounded_operations(_ETRS89_2D, three_d)
+            if math.hypot(first.bound_m, second.bound_m) <= MAX_BY_ETRS89_M
+        ]
+    return tuple(sorted(found, key=lambda operation: operation.bound_m))
+
+
+def _operations_between(name: str, target: str, three_d: bool) -> list[BoundedOperation]:
+    group = _group(name, target, three_d)
+    return [
+        BoundedOperation(
+            transformer,
+            float(transformer.accuracy),
+            str(transformer.description)[:_MAX_NAME],
+            any(word in transformer.definition for word in _TIMELY),
+            (transformer.area_of_use,),
+        )
+        for transformer in (() if group is None else group.transformers)
+        if transformer.accuracy >= 0
+    ]
+
+
+def _group(name: str, target: str, three_d: bool) -> TransformerGroup | None:
     geographic = named_system(name).geodetic_crs
     assert geographic is not None
     source = geographic.to_3d() if three_d else geographic.to_2d()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # missing grids only reduce the choice
         try:
-            group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+            return TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
         except IndexError:  # pyproj raises it if PROJ knows no operation
-            return ()
-    stated = [
-        BoundedOperation(
-            transformer,
-            float(transformer.accuracy),
-            str(transformer.description)[:_MAX_NAME],
-            any(word in transformer.definition for word in _TIMELY),
-        )
-        for transformer in group.transformers
-        if transformer.accuracy >= 0
+            return None
+
+
+def _chained(first: BoundedOperation, second: BoundedOperation) -> BoundedOperation:
+    steps = [
+        one.transformer.definition.removeprefix("proj=pipeline ")
+        if one.transformer.definition.startswith("proj=pipeline ")
+        else f"step {one.transformer.definition}"
+        for one in (first, second)
     ]
-    return tuple(sorted(stated, key=lambda operation: operation.bound_m))
+    return BoundedOperation(
+        Transformer.from_pipeline(f"proj=pipeline {' '.join(steps)}"),
+        round(math.hypot(first.bound_m, second.bound_m), 3),
+        f"{first.name} + {second.name}"[:_MAX_NAME],
+        first.needs_epoch or second.needs_epoch,
+        (*first.areas, *second.areas),
+    )
+
+
+class MissingOperation(NamedTuple):
+    """Why positions cannot be transformed to ITRF2014, and what helps."""
+
+    reason: str
+    grid: str | None = None  # name of a grid in PROJ that is not installed, with which it would be possible
+
+
+def missing_operation(name: str, lon_deg: float, lat_deg: float) -> MissingOperation:
+    """Why `bounded_operations` has none: the most accurate operation at a place, and the grid of a better one.
+
+    Parameters
+    ----------
+    name : str
+        Of the system, as `normalize_crs` writes it.
+    lon_deg, lat_deg : float
+        Approximate position. [deg]
+    """
+    return _missing(name, round(lon_deg), round(lat_deg))
+
+
+@lru_cache(maxsize=256)
+def _missing(name: str, lon_deg: int, lat_deg: int) -> MissingOperation:
+    at = np.array([float(lon_deg)]), np.array([float(lat_deg)])
+    reason = f"no transformation with a stated accuracy of at most {MAX_BY_ETRS89_M:g} m to ITRF2014 is available"
+    here = (
+        [one for one in _operations_between(name, target, False) if covers(one.areas[0], *at, 0.5)[0]]
+        for target in (_ETRS89_2D, "EPSG:4326")
+    )
+    if nearest := min(chain.from_iterable(here), key=lambda one: one.bound_m, default=None):
+        plain = nearest.name.replace("axis order change (2D) + ", "").replace(" + axis order change (2D)", "")
+        step = " for one step of it" if nearest.bound_m <= MAX_BY_ETRS89_M else ""
+        reason += f": {plain[:80]!r} states {nearest.bound_m:g} m{step}"
+    best_m, grid = MAX_BY_ETRS89_M, None
+    group = _group(name, _ETRS89_2D, three_d=False)
+    for one in () if group is None else group.unavailable_operations:
+        missing = [part.short_name for part in one.grids if not part.available]
+        if missing and 0 <= one.accuracy < best_m and covers(one.area_of_use, *at, 0.5)[0]:
+            best_m, grid = one.accuracy, str(missing[0])
+    if grid is not None:
+        reason += f"; with the grid {grid} that step would have {best_m:g} m"
+    return MissingOperation(reason, grid)
 
 
 def list_operations(
@@ -88,7 +171,7 @@ def list_operations(
     """
     known = bounded_operations(name, three_d)
     if not known:
-        return "no transformation with a stated accuracy to WGS 84 / ITRF is available"
+        return missing_operation(name, lon_deg, lat_deg).reason
     here = [one for one in known if one.covers(np.array([lon_deg]), np.array([lat_deg]))[0]]
     if not here:
         return "no transformation with a stated accuracy is made for this place"
@@ -107,6 +190,7 @@ def use_grids(folder: Path | None) -> None:
     own = _own_folders()
     datadir.set_data_dir(own if folder is None else f"{own}{os.pathsep}{folder}")
     bounded_operations.cache_clear()
+    _missing.cache_clear()
     best_effort.cache_clear()
 
 

@@ -15,11 +15,19 @@ import numpy.typing as npt
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.enums import TransformDirection
+from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.geodesy.frames import check_lon_lat
-from app.geodesy.operations import BoundedOperation, list_operations, move_to_epoch, plate_motion
+from app.geodesy.operations import (
+    BoundedOperation,
+    bounded_operations,
+    list_operations,
+    missing_operation,
+    move_to_epoch,
+    plate_motion,
+)
 from app.geodesy.systems import (
     ELLIPSOID,
     TARGET,
@@ -255,9 +263,10 @@ def place_positions(
         middle_deg = _middle(lon[known], lat[known]) if known.any() else (0.0, 0.0)
         frame = _global_frame(name, middle_deg, realization, epoch)
         return PlacedPositions(lon, lat, height_m, known, name, *frame)
-    has_height = bool(np.isfinite(heights[known]).all())
+    has_height = bool(np.isfinite(heights[known]).any())  # positions without one are transformed with the height 0
     middle = int(np.flatnonzero(known)[np.argsort(lon[known])[known.sum() // 2]])
-    original = (float(first[middle]), float(second[middle]), float(heights[middle]) if has_height else None)
+    up = np.where(np.isfinite(heights), heights, 0.0)
+    original = (float(first[middle]), float(second[middle]), float(up[middle]) if has_height else None)
     place_deg = (float(lon[middle]), float(lat[middle]))
     moved = _to_itrf2014(name, place_deg, original, realization, epoch, accuracy_m)
     if isinstance(moved, str):
@@ -267,12 +276,12 @@ def place_positions(
     if unproject is not None:
         first, second = unproject.transform(first, second)
     times = np.full_like(first, _epoch_of(operation, epoch))
-    x, y, z, _ = operation.transformer.transform(first, second, np.where(np.isfinite(heights), heights, 0.0), times)
+    x, y, z, _ = operation.transformer.transform(first, second, up, times)
     reached = known & np.isfinite(x) & np.isfinite(y) & operation.covers(lon, lat)
     return PlacedPositions(
         np.where(reached, x, np.nan),
         np.where(reached, y, np.nan),
-        np.where(reached, z, np.nan) if has_height else height_m,
+        np.where(reached & np.isfinite(heights), z, np.nan) if has_height else height_m,
         reached,
         name,
         *_transformed_frame(name, place_deg, operation, realization, epoch),
@@ -542,7 +551,15 @@ def _height_transformer(base_wkt: str, datum: str) -> Transformer:
     target = CompoundCRS("heights", [base.to_2d(), vertical])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # missing grids are named below
-        group = TransformerGroup(base.to_3d(), target, always_xy=True, allow_ballpark=False)
+        try:
+            group = TransformerGroup(base.to_3d(), target, always_xy=True, allow_ballpark=False)
+        except ProjError as error:
+            raise ReferenceSystemError(
+                f"a grid for heights above {datum} ({vertical.name}) is installed, but cannot be read: {error}"[:300],
+                field="vertical_datum",
+                limit="grids of cdn.proj.org",
+                cure="install it again with projsync in $WAYMARK_PROJ_GRIDS_DIR, and restart the server",
+            ) from error
     stated = [one for one in group.transformers if one.accuracy >= 0]
     if stated:
         return min(stated, key=lambda one: one.accuracy)
@@ -563,7 +580,7 @@ def _transformed(
     name: str, lon_deg: Floats, lat_deg: Floats, height_m: Floats, origin: Origin, returns: bool
 ) -> SystemPositions:
     """By an operation with a stated accuracy, backwards."""
-    three_d = origin.ellipsoidal_height and bool(np.isfinite(height_m).all())
+    three_d = origin.ellipsoidal_height and bool(np.isfinite(height_m).any())
     middle = int(np.argsort(lon_deg)[len(lon_deg) // 2])
     place = float(lon_deg[middle]), float(lat_deg[middle])
     source = system_of_realization(name, origin.realization) or name
@@ -572,11 +589,15 @@ def _transformed(
         known = [operation for operation in operations if not operation.needs_epoch]
         operations = known or "the transformation depends on time, and the epoch of the positions is not known"
     if isinstance(operations, str):
+        grid = None if bounded_operations(source, three_d) else missing_operation(source, *place).grid
+        install = (
+            f"projsync --file {grid} --target-dir $WAYMARK_PROJ_GRIDS_DIR, and restart the server; or " if grid else ""
+        )
         raise ReferenceSystemError(
-            f"positions cannot be staked in {name}: {operations}",
+            f"positions cannot be transformed to {name}: {operations}",
             field="crs",
             limit="a transformation with a stated accuracy",
-            cure="choose a system on WGS 84 or on the road's own datum, declare the epoch, or add the grids",
+            cure=f"{install}choose a system on WGS 84 or ETRS89, or that in which they came; declare the epoch",
         )
     heights = np.where(np.isfinite(height_m), height_m, 0.0) if three_d else np.zeros_like(lon_deg)
     epochs = np.full_like(lon_deg, origin.epoch or 0.0)
@@ -584,7 +605,7 @@ def _transformed(
         x, y, z = _undone(operation.transformer, lon_deg, lat_deg, heights, epochs)
         if np.isfinite(x).all() and np.isfinite(y).all():
             first, second = _projected(name, np.asarray(x), np.asarray(y))
-            up = np.asarray(z) if three_d else height_m
+            up = np.where(np.isfinite(height_m), z, np.nan) if three_d else height_m
             note = f"transformed to {name}, stated accuracy {operation.bound_m:g} m: {operation.name}"
             if returns:
                 note += "; it undoes the transformation of the road"

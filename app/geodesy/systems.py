@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import re
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import AfterValidator, Field
 from pyproj import CRS, Transformer
+from pyproj.crs import GeographicCRS
+from pyproj.crs.coordinate_system import Ellipsoidal2DCS
+from pyproj.crs.enums import Ellipsoidal2DCSAxis
 from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError
@@ -137,12 +140,24 @@ def system_of_wkt(wkt: str) -> tuple[CRS, str]:
 
 
 def geographic_code(base: CRS) -> str | None:
-    """``EPSG:code`` of the geographic system that has the datum of another one, by the datum's name in the registry."""
-    datum = _datum_name(base)
-    for listed in base.list_authority("EPSG", min_confidence=25):
+    """``EPSG:code`` of the geographic system with two axes on the datum of another one, by the datum's name.
+
+    It has the same meridian and unit; the order of the axes may differ.
+    """
+    if base.datum is None or base.prime_meridian is None:
+        return None
+    datum, unit = _datum_name(base), base.axis_info[0].unit_conversion_factor
+    flat = base
+    if abs(unit - math.radians(1.0)) < 1e-12:  # systems with three axes, or with the longitude first, are not listed
+        order = Ellipsoidal2DCS(axis=Ellipsoidal2DCSAxis.LATITUDE_LONGITUDE)
+        flat = GeographicCRS(name=base.name, datum=base.datum, ellipsoidal_cs=order)
+    for listed in flat.list_authority("EPSG", min_confidence=25):
         known = CRS.from_epsg(int(listed.code))  # the geocentric system of the datum is among them
         if known.is_geographic and len(known.axis_info) == 2 and _datum_name(known) == datum:
-            return f"EPSG:{listed.code}"
+            meridian, own = base.prime_meridian, known.prime_meridian
+            is_same = own is not None and meridian.longitude == own.longitude
+            if is_same and abs(known.axis_info[0].unit_conversion_factor - unit) < 1e-12:
+                return f"EPSG:{listed.code}"
     return None
 
 
@@ -158,6 +173,18 @@ def _unusable_wkt(message: str) -> ReferenceSystemError:
         field="crs",
         limit="an EPSG code, or a projected system on a datum of the EPSG registry",
         cure="declare crs if the coordinates are in a system with an EPSG code; otherwise transform the file to one",
+    )
+
+
+def have_same_places(name: str, other: str) -> bool:
+    """Whether two geographic systems differ only in the order of their axes, or in the axis of heights."""
+    one, two = named_system(name), named_system(other)
+    return bool(
+        one.is_geographic
+        and two.is_geographic
+        and one.datum == two.datum
+        and one.prime_meridian == two.prime_meridian
+        and one.axis_info[0].unit_conversion_factor == two.axis_info[0].unit_conversion_factor
     )
 
 
@@ -404,3 +431,60 @@ def _codes() -> dict[str, str]:
     for info in query_crs_info("EPSG", PJType.VERTICAL_CRS):
         codes[_plain(info.name)] = codes[_plain(info.name.removesuffix(" height"))] = info.code
     return codes
+
+
+class HeightSystem(NamedTuple):
+    """What the heights of a compound system, or of a geographic system with three axes, are above."""
+
+    name: str  # for people
+    datum: str | None  # as `normalize_vertical_datum` writes it; None if that knows no such datum
+    unit_m: float  # [m] unit of the heights
+    is_depth: bool = False  # they are counted downwards
+
+
+def split_heights(crs: str) -> tuple[str, HeightSystem | None]:
+    """The horizontal part of a system, and what it states about heights; the system as it is if it states nothing.
+
+    Parameters
+    ----------
+    crs : str
+        As `normalize_crs` takes it, or WKT.
+
+    Raises
+    ------
+    ReferenceSystemError
+        It has a form that is not known here.
+    """
+    name = crs if "[" in crs else normalize_crs(crs)
+    try:
+        system = CRS.from_user_input(name)
+    except CRSError:
+        return name, None  # refused where it is used
+    if system.is_geographic and not system.is_compound and len(system.axis_info) == 3:
+        return name, HeightSystem(system.name, ELLIPSOID, system.axis_info[2].unit_conversion_factor)
+    if not system.is_compound or len(system.sub_crs_list) != 2:
+        return name, None
+    horizontal, vertical = (part.source_crs or part if part.is_bound else part for part in system.sub_crs_list)
+    return name_system(horizontal) or horizontal.to_wkt(), _height_system(vertical)
+
+
+def name_system(system: CRS) -> str | None:
+    """``EPSG:code`` of a system that was read as WKT; None if the EPSG registry does not list it."""
+    code = system.to_epsg(min_confidence=70)
+    if code is not None:
+        return f"EPSG:{code}"
+    is_plain = system.is_geographic and not system.is_compound and not system.is_bound
+    return geographic_code(system) if is_plain else None
+
+
+def _height_system(vertical: CRS) -> HeightSystem:
+    """A datum whose system in metres is listed beside this one, such as NAVD88 beside NAVD88 in feet, is that datum."""
+    axis = vertical.axis_info[0]
+    code = vertical.to_epsg(min_confidence=70)
+    named = _codes().get(_plain(vertical.name.partition(" (")[0]))
+    for known in (code, named):
+        if known is None or axis.direction != "up" or not _is_height_in_metres(int(known)):
+            continue
+        if known == code or CRS.from_epsg(int(known)).datum == vertical.datum:
+            return HeightSystem(vertical.name, f"EPSG:{int(known)}", axis.unit_conversion_factor)
+    return HeightSystem(vertical.name, None, axis.unit_conversion_factor, is_depth=axis.direction == "down")

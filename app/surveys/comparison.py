@@ -14,6 +14,7 @@ from typing_extensions import TypedDict
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.table import Fault, Severity, warn
 from app.geodesy import move_to_epoch
+from app.geodesy.frames import metres_per_radian
 from app.surveys.consistency_checks import nearest_of
 from app.surveys.georeference import GeoreferencedSurvey, east_north_m
 from app.surveys.location_checks import measured_changes
@@ -90,14 +91,17 @@ def compare_survey(
             lon_deg, lat_deg, np.where(np.isfinite(epoch), epoch, survey.placed.epoch), survey.placed.epoch
         )
         lon_deg, lat_deg = moved.lon_deg, moved.lat_deg
-    others = np.column_stack(east_north_m(lon_deg, lat_deg, survey.origin_deg)).reshape(-1, 2)
-    points = np.column_stack([survey.east_m, survey.north_m])
+    placed = survey.placed
     if matched is None:
-        matched = _nearest_once(points, others)
+        others = np.column_stack(east_north_m(lon_deg, lat_deg, survey.origin_deg)).reshape(-1, 2)
+        matched = _nearest_once(np.column_stack([survey.east_m, survey.north_m]), others)
     known = matched >= 0
-    east, north, up = (np.full(len(points), np.nan) for _ in range(3))
-    east[known] = points[known, 0] - others[matched[known], 0]
-    north[known] = points[known, 1] - others[matched[known], 1]
+    east, north, up = (np.full(len(matched), np.nan) for _ in range(3))
+    # on the ellipsoid: on a sphere residuals would be up to 0.5 % too short or too long
+    across_deg = (placed.lon_deg[known] - lon_deg[matched[known]] + 180.0) % 360.0 - 180.0
+    east_m, north_m = metres_per_radian(np.radians(lat_deg[matched[known]]))
+    east[known] = np.radians(across_deg) * east_m
+    north[known] = np.radians(placed.lat_deg[known] - lat_deg[matched[known]]) * north_m
     up[known] = survey.height_m[known] - height_m[matched[known]]
     return Comparison(matched, east, north, up)
 

@@ -248,7 +248,9 @@ class GeoreferencedSurvey:
     # row has no position
     east_m: Floats
     north_m: Floats
-    height_m: Floats  # shape (N,): [m] above the vertical datum of the declaration; NaN where there is none
+    # shape (N,): [m] above the vertical datum of the declaration; ellipsoidal ones in WGS 84 / ITRF, as the positions;
+    # NaN where there is none
+    height_m: Floats
 
     @property
     def origin_deg(self) -> tuple[float, float]:
@@ -289,7 +291,7 @@ def georeference_survey(table: SurveyTable, declaration: ImportDeclaration, accu
         accuracy_m=accuracy_m,
     )
     east, north = east_north_m(placed.lon_deg, placed.lat_deg, median_deg(placed))
-    return GeoreferencedSurvey(table, placed, east, north, height)
+    return GeoreferencedSurvey(table, placed, east, north, np.where(placed.placed, placed.height_m, height))
 
 
 def without_rows(table: SurveyTable, rows: Sequence[int]) -> SurveyTable:

@@ -54,9 +54,10 @@ def list_grammars() -> dict[str, Grammar]:
     from benchmarks.fuzz.grammar_logs import LOG_GRAMMARS
     from benchmarks.fuzz.grammar_packets import PACKET_GRAMMARS
     from benchmarks.fuzz.grammar_roads import ROAD_GRAMMARS
+    from benchmarks.fuzz.grammar_surveys import SURVEY_GRAMMARS
     from benchmarks.fuzz.grammar_traces import TRACE_GRAMMARS
     from benchmarks.fuzz.grammar_tracks import TRACK_GRAMMARS
     from benchmarks.fuzz.grammar_videos import VIDEO_GRAMMARS
 
     of_logs = LOG_GRAMMARS | PACKET_GRAMMARS | TRACK_GRAMMARS | TRACE_GRAMMARS
-    return of_logs | DRIVE_GRAMMARS | VIDEO_GRAMMARS | ROAD_GRAMMARS
+    return of_logs | DRIVE_GRAMMARS | VIDEO_GRAMMARS | ROAD_GRAMMARS | SURVEY_GRAMMARS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from typing import NamedTuple
 
@@ -27,13 +27,17 @@ from app.formats.surveys.table import (
 )
 from app.formats.text import SPACES, as_utf8, detect_delimiter, repeated_names, split_rows
 from app.geodesy import reference_system
+from app.geodesy.systems import HeightSystem
 
 # === Where the rows of delimited text begin, and what their columns are: by a header, or by position.
 
 
 _NUMERIC = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*")
 _MAX_NUMBER = 40  # [character] longest cell that is a number; a float64 needs 24
-_UNIT = re.compile(r"\s*[\[(]?(?:m|metres?|meters?|ft|us-?ft|usft|sft|feet|deg|degrees|°)[\])]?\s*", re.IGNORECASE)
+_UNIT = re.compile(
+    r"\s*[\[(]?(?:m|metres?|meters?|ft|us-?ft|usft|sft|ftus|ift|feet|foot|mm|cm|km|deg|degrees|°)[\])]?\s*",
+    re.IGNORECASE,
+)
 _MIN_SHARE = 0.9  # [1] of the first rows that must be numbers, or lie in the area of use
 _MIN_ROWS = 2  # columns cannot be identified by the position of one row alone
 _COORDINATES = ("lon_deg", "lat_deg", "easting", "northing")
@@ -47,6 +51,7 @@ class Header:
     start: int  # index of the first row of data
     last_takes_rest: bool = False  # whether further cells of a row belong to the last column, a description
     min_width: int = 0  # cells that a row of such a table must have
+    units: tuple[str, ...] = ()  # of a row of units, one a name
     detected: list[Detected] = field(default_factory=list)
     faults: Faults = field(default_factory=Faults)
 
@@ -120,7 +125,8 @@ def _named(rows: Sequence[Sequence[str]], names: Sequence[str], index: int) -> H
         header.names = header.names[:width]
     if header.start < len(rows) and sum(1 for cell in rows[header.start] if _UNIT.fullmatch(cell)) >= 2:
         header.start += 1
-        cells = " ".join(cell.strip() for cell in rows[header.start - 1] if cell.strip())
+        header.units = tuple(cell.strip() for cell in rows[header.start - 1])
+        cells = " ".join(filter(None, header.units))
         header.detected.append(Detected("row of units", cells[:60], "it follows the header and is not a row of data"))
     return header
 
@@ -228,7 +234,7 @@ _COMMENTS = ("#", "//")
 _COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|//)", re.MULTILINE)
 _SAMPLE_LINES = 50  # lines by which the delimiter and the header are detected
 _BATCH = 10_000  # rows at a time
-_DECIMAL_COMMAS = re.compile(r"(?:\S+[ \t]+)?[+-]?[0-9]+,[0-9]+[ \t]+[+-]?[0-9]+,[0-9]+(?:[ \t].*)?\s*")
+_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]['\u20190-9]*,[0-9]+")  # also with apostrophes between groups of digits
 
 
 class _Lines:
@@ -291,8 +297,43 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
     if lines.comments:
         value = f"{lines.comments} lines left out"
         detected.append(Detected("comments", value, f"they begin with {' or '.join(_COMMENTS)}"))
-    return SourceTable(
-        "csv", header.names, table, faults=header.faults, detected=tuple(detected), has_names=not header.last_takes_rest
+    source = SourceTable(
+        "csv", header.names, table, faults=header.faults, detected=tuple(detected),
+        has_names=not header.last_takes_rest, units=header.units,
+    )  # fmt: skip
+    return _with_own_points(source, declaration)
+
+
+_OWN_POINTS = ("x", "y", "z_m")
+_OWN_SYSTEM = ("geometry_crs", "geometry_vertical_datum")
+
+
+def _with_own_points(source: SourceTable, declaration: ImportDeclaration) -> SourceTable:
+    """The points of a CSV that was exported with `crs` (`app.formats.exports.write_csv`): x is the easting or the
+    longitude, and the columns state the system; `lon_deg`, `lat_deg` and `height_m` are those of the registry.
+    """
+    is_declared = any(role in declaration.columns for role in (*_COORDINATES, "height")) or declaration.decimal == ","
+    if is_declared or not set(source.names).issuperset((*_OWN_POINTS, *_OWN_SYSTEM)):
+        return source
+    columns = dict(zip(source.names, source.columns, strict=True))
+    stated = [{cell for cell in columns[name] if cell} for name in _OWN_SYSTEM]
+    if any(len(values) > 1 for values in stated):
+        raise InvalidParameter(
+            f"the rows are in several systems: {', '.join(sorted(stated[0] | stated[1])[:4])}"[:200],
+            field="file",
+            limit="one CRS and one vertical datum a file",
+            cure="export with crs and vertical_datum",
+        )
+    read = [read_numbers(columns[name], name, required=name != "z_m") for name in _OWN_POINTS]
+    source.faults.add(fault for _values, faults in read for fault in faults)
+    crs, datum = (next(iter(values), None) for values in stated)
+    detected = Detected("coordinates", "the columns x, y and z_m", "the columns geometry_* state their system")
+    return replace(
+        source,
+        points=(read[0][0], read[1][0], read[2][0]),
+        crs=crs,
+        heights=HeightSystem(datum, datum, 1.0) if datum else None,
+        detected=(*source.detected, detected),
     )
 
 
@@ -301,10 +342,18 @@ def _detect_delimiter(utf8: bytes, declaration: ImportDeclaration) -> str:
     sample = list(islice(_Lines(utf8, keep_ends=False), _SAMPLE_LINES))
     found = detect_delimiter(sample, _DELIMITERS)
     if found == "," and declaration.decimal != ".":
-        spaced = sum(1 for line in sample if _DECIMAL_COMMAS.fullmatch(line))
-        if 2 * spaced > len(sample):
+        filled = [line for line in sample if line.strip()]
+        if 2 * sum(map(_has_decimal_commas, filled)) > len(filled):
             return SPACES
     return found
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Whether a line has two numbers with decimal commas between blanks, and no other commas before the last one."""
+    words = line.split()
+    numbers = [_DECIMAL_COMMA.fullmatch(word) is not None for word in words]
+    last = max((k for k, is_number in enumerate(numbers) if is_number), default=0)
+    return sum(numbers) >= 2 and all(numbers[k] or "," not in word for k, word in enumerate(words[:last]))
 
 
 def _check_names(names: tuple[str, ...]) -> None:

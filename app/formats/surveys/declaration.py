@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, Field, model_validator, with_config
 
-from app.errors import InvalidParameter
-from app.geodesy.systems import VerticalDatum
+from app.errors import InvalidParameter, ReferenceSystemError
+from app.geodesy.systems import (
+    ELLIPSOID,
+    VERTICAL_RULE,
+    HeightSystem,
+    VerticalDatum,
+    normalize_vertical_datum,
+    split_heights,
+)
 from app.inputs import INPUT, Flag, Number, Text
 from app.markers.reading import Status
 
@@ -54,6 +61,47 @@ def choose_foot(declared: str | None, crs_unit_m: float) -> tuple[str, bool]:
         return declared, False
     own = next((foot for foot in _FOOT_NAMES if abs(crs_unit_m / METRES[foot] - 1) < 1e-9), None)
     return own or "ft-intl", own is not None
+
+
+def choose_datum(declared: str | None, heights: HeightSystem, system: str) -> str:
+    """The vertical datum of heights in a system that states what they are above.
+
+    Parameters
+    ----------
+    declared : str or None
+        The declared one, as `normalize_vertical_datum` writes it.
+    system : str
+        Whose heights they are, for people.
+
+    Raises
+    ------
+    InvalidParameter
+        The two differ, the system's is not known and none is declared, or the heights are depths.
+    """
+    if heights.is_depth:
+        raise InvalidParameter(
+            f"the heights in {system[:60]} are depths: {heights.name[:60]}",
+            field="vertical_datum",
+            limit="heights upwards",
+            cure="write heights with the opposite sign and declare their datum and the horizontal CRS",
+        )
+    if declared is None and heights.datum is None:
+        raise InvalidParameter(
+            f"the heights in {system[:60]} are above {heights.name[:60]!r}, a vertical datum that is not known here",
+            field="vertical_datum",
+            limit=VERTICAL_RULE,
+            cure="declare vertical_datum, and height_unit where they are in feet",
+        )
+    is_level = heights.datum not in (None, ELLIPSOID)  # programs also write three axes for other heights
+    if declared is not None and is_level and declared != heights.datum:
+        raise InvalidParameter(
+            f"the heights in {system[:60]} are above {heights.datum} ({heights.name[:60]}),"
+            f" the declaration has {declared}",
+            field="vertical_datum",
+            limit=str(heights.datum),
+            cure="leave vertical_datum out, or declare only the horizontal CRS if the heights are above another datum",
+        )
+    return declared or str(heights.datum)
 
 
 _Name = Annotated[Text, Field(min_length=1, max_length=200)]
@@ -171,6 +219,22 @@ class ImportDeclaration(BaseModel):
     leave_out: tuple[Annotated[int, Field(strict=True, ge=1, le=1_000_000)], ...] = Field(
         (), max_length=1000, description="Numbers of rows that are neither checked nor stored."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_heights_in_crs(cls, data: Any) -> Any:
+        """A compound system is a horizontal one with a vertical datum."""
+        if not isinstance(data, dict) or not isinstance(data.get("crs"), str):
+            return data
+        try:
+            crs, heights = split_heights(data["crs"])
+            declared = data.get("vertical_datum")
+            datum = normalize_vertical_datum(declared) if isinstance(declared, str) else None
+        except ReferenceSystemError:
+            return data  # refused by its own field
+        if heights is None or data.get("ignore_heights"):
+            return {**data, "crs": crs} if heights is not None else data
+        return {**data, "crs": crs, "vertical_datum": choose_datum(datum, heights, data["crs"])}
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

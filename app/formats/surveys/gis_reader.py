@@ -7,6 +7,7 @@ import sqlite3
 import struct
 import warnings
 import zipfile
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.format import is_file
 from app.formats.surveys.coordinates import points_of
 from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Faults, SourceTable, Texts
+from app.geodesy.systems import name_system, split_heights
 
 _SQLITE = b"SQLite format 3\x00"
 _SHAPEFILE_CODE = 9994  # ESRI Shapefile Technical Description (1998), file header
@@ -25,6 +27,7 @@ _PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg")
 _MAX_MEMBERS = 50  # files of an archive
 MAX_INFLATED = 512 * 1024**2
 """Largest Shapefile, inflated. [byte]"""
+_MAX_PRJ = 100_000  # [character] of a .prj; those of compound systems have about 2000
 _PART = 100_000  # features read at a time, to bound memory
 
 
@@ -50,7 +53,30 @@ def read_shapefile(data: bytes) -> SourceTable:
     UnreadableUpload
         The archive is damaged, holds no Shapefile or several, or is too large when inflated.
     """
-    return _read("shapefile", repack_shapefile(data), None)
+    packed = repack_shapefile(data)
+    table = _read("shapefile", packed, None)
+    stated = _read_prj(packed)
+    if stated is None:
+        return table
+    own, heights = split_heights(stated)
+    if table.crs is None:  # GDAL reads WKT 1 alone
+        named = name_system(CRS.from_user_input(own))
+        table = replace(table, crs=named or own)
+    return replace(table, heights=heights)
+
+
+def _read_prj(packed: bytes) -> str | None:
+    """WKT of the .prj; None if there is none that can be read."""
+    with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+        if "survey.prj" not in archive.namelist():
+            return None
+        text = archive.read("survey.prj").decode("utf-8-sig", "replace").strip("\x00 \t\r\n")
+    if len(text) > _MAX_PRJ or "[" not in text:
+        return None
+    try:
+        return CRS.from_wkt(text).to_wkt()
+    except CRSError:
+        return None
 
 
 def list_gpkg_layers(data: bytes) -> list[str]:
@@ -217,10 +243,9 @@ def name_crs(crs: str | None) -> str | None:
     if not crs:
         return None
     try:
-        code = CRS.from_user_input(crs).to_epsg(min_confidence=70)
+        return name_system(CRS.from_user_input(crs))
     except CRSError:
         return None
-    return f"EPSG:{code}" if code is not None else None
 
 
 def _damaged(message: str) -> UnreadableUpload:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import chain, islice
@@ -25,7 +26,15 @@ from app.formats.format import (
 )
 from app.formats.surveys.coordinates import check_second_pair, crs_unit, read_coordinates, unit_factor, without_zone
 from app.formats.surveys.csv_reader import read_csv, read_gsi
-from app.formats.surveys.declaration import FEET, METRES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration, choose_foot
+from app.formats.surveys.declaration import (
+    FEET,
+    METRES,
+    NUMBER_ROLES,
+    TEXT_ROLES,
+    ImportDeclaration,
+    choose_datum,
+    choose_foot,
+)
 from app.formats.surveys.roles import CodeForm, cell_text, find_roles
 from app.formats.surveys.table import (
     MAX_COLUMNS,
@@ -44,7 +53,7 @@ from app.formats.surveys.table import (
 )
 from app.formats.text import guess_encoding
 from app.geodesy import normalize_crs, reference_system
-from app.geodesy.systems import system_of_wkt
+from app.geodesy.systems import HeightSystem, have_same_places, split_heights, system_of_wkt
 from app.values import Floats
 
 # === Surveys as GeoJSON (RFC 7946).
@@ -62,7 +71,7 @@ def read_geojson(data: bytes) -> SourceTable:
         It is no JSON, no FeatureCollection, or has too many features or names.
     """
     try:
-        document = orjson.loads(data)
+        document = orjson.loads(data.removeprefix(BOM_UTF8))  # RFC 8259, section 8.1: it may be there
     except (orjson.JSONDecodeError, RecursionError) as error:
         raise UnreadableUpload(f"not JSON: {error}", field="file", limit="RFC 8259", cure=_CURE) from error
     features = document.get("features") if isinstance(document, dict) else None
@@ -271,7 +280,12 @@ _DOCUMENTS = (
     (b"LASF", "a point cloud", "export the points of the markers alone"),
 )
 """First bytes of files that are sent by mistake, their kind, and how a survey is made of it."""
-_UNIT_ENDINGS = (("_usft", "ft-us"), ("_ftus", "ft-us"), ("_ft", "ft-intl or ft-us"), ("(ft)", "ft-intl or ft-us"))
+_UNIT_ENDING = re.compile(
+    r"(?:^|_|\s*[\[(]\s*)(?:(?P<us>us[-_ ]?s?(?:urvey[-_ ]?)?(?:ft|feet|foot)|sft|ft[-_ ]?us)"
+    r"|(?P<intl>ift|ft[-_ ]?intl)|(?P<ft>ft|feet|foot)|(?P<m>m|met(?:re|er)s?)|(?P<other>mm|cm|km))\s*[\])]?$"
+)
+_MAX_NAME = 100  # [character] of a name that are looked at
+_UNITS_NAMED = {"us": "ft-us", "intl": "ft-intl", "ft": "ft-intl or ft-us", "m": "m"}
 
 
 def read_survey(data: bytes, declaration: ImportDeclaration, code_form: CodeForm | None = None) -> SurveyTable:
@@ -320,10 +334,13 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
         raise UnreadableUpload("the file has no points", field="file", limit="at least one row", cure="send the survey")
     places, faults, detected = find_roles(source, declaration, code_form)
     read = read_coordinates(source, declaration, places)
-    crs, system = _crs(source.crs or read.crs, source.format, declaration, read.projected)
+    source, of_file = _split(source, read.crs, declaration)
+    crs, system = _crs(of_file, source.format, declaration, read.projected)
     has_height = read.height is not None
     unit, height_unit, feet = _units(source, declaration, system, has_height=has_height)
-    _check_datum(declaration, has_height=has_height)
+    vertical_datum = _datum(declaration, source.heights, of_file or crs, has_height=has_height)
+    if vertical_datum is not None and declaration.vertical_datum is None:
+        read.detected.append(Detected("vertical_datum", vertical_datum, "the CRS of the file"))
     is_local = declaration.local_grid is not None
     if is_local and (_is_wkt(crs) or not system.is_projected):
         raise InvalidParameter(
@@ -359,8 +376,25 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
     return SurveyTable(
         source.format, first, second, read.height, unit != "deg", crs, unit, height_unit, texts,
         numbers, source.faults, (*by_content, *source.detected, *detected, *read.detected),
-        written=written,
+        written=written, vertical_datum=vertical_datum,
     )  # fmt: skip
+
+
+def _split(
+    source: SourceTable, of_geometry: str | None, declaration: ImportDeclaration
+) -> tuple[SourceTable, str | None]:
+    """The table with what its CRS states about heights, and the horizontal part of its CRS."""
+    stated = source.crs or of_geometry
+    if stated is None:
+        return source, None
+    horizontal, heights = split_heights(stated)
+    heights = heights or source.heights
+    if heights is None:
+        return source, horizontal
+    unit = source.height_unit
+    if (unit, source.unit, declaration.height_unit) == (None, None, None):
+        unit = next((name for name, metres in METRES.items() if abs(heights.unit_m / metres - 1) < 1e-9), None)
+    return replace(source, heights=heights, height_unit=unit), horizontal
 
 
 def _is_wkt(crs: str) -> bool:
@@ -378,12 +412,7 @@ def _crs(
     if file_format == "geojson" and in_file is None:
         in_file = None if declaration.crs is not None else "OGC:CRS84"
     declared = normalize_crs(declaration.crs) if declaration.crs is not None else None
-    if (
-        in_file is not None
-        and declared is not None
-        and in_file != declared
-        and {in_file, declared} != {"OGC:CRS84", "EPSG:4326"}
-    ):
+    if in_file is not None and declared is not None and in_file != declared and not have_same_places(in_file, declared):
         raise InvalidParameter(
             f"the file is in {in_file}, the declaration has {declared}",
             field="crs",
@@ -437,6 +466,14 @@ def _units(
             limit=str(source.height_unit),
             cure="leave height_unit out, or export the file again in the unit that its heights are in",
         )
+    of_heights = of_file if declaration.unit is None and source.height_unit is None else None
+    if None not in (of_heights, declaration.height_unit) and of_heights != declaration.height_unit:
+        raise InvalidParameter(
+            f"the file is in {of_heights}, the declaration has heights in {declaration.height_unit}",
+            field="height_unit",
+            limit=str(of_heights),
+            cure=f"leave height_unit out, or declare unit {of_heights}, too, if only the heights are in another unit",
+        )
     height_unit = declaration.height_unit or source.height_unit or of_file or declaration.unit
     if height_unit is None and has_height and own in METRES and own != "m":
         raise InvalidParameter(
@@ -448,14 +485,20 @@ def _units(
     return unit, height_unit or "m", faults
 
 
-def _check_datum(declaration: ImportDeclaration, *, has_height: bool) -> None:
-    if has_height and declaration.vertical_datum is None:
-        raise InvalidParameter(
-            "the file has heights, and their vertical datum is not declared",
-            field="vertical_datum",
-            limit="ellipsoid, or the datum, e.g. EPSG:5703",
-            cure="declare vertical_datum, or ignore_heights to leave them out",
-        )
+def _datum(
+    declaration: ImportDeclaration, heights: HeightSystem | None, system: str, *, has_height: bool
+) -> str | None:
+    """The vertical datum: declared, or that of the file's CRS."""
+    if not has_height or heights is None:
+        if has_height and declaration.vertical_datum is None:
+            raise InvalidParameter(
+                "the file has heights, and their vertical datum is not declared",
+                field="vertical_datum",
+                limit="ellipsoid, or the datum, e.g. EPSG:5703",
+                cure="declare vertical_datum, or ignore_heights to leave them out",
+            )
+        return declaration.vertical_datum
+    return choose_datum(declaration.vertical_datum, heights, f"the file ({system})")
 
 
 def _unit_names(
@@ -465,15 +508,16 @@ def _unit_names(
     faults = []
     for role, unit_used in (("easting", unit), ("northing", unit), ("height", height_unit)):
         column = places[role] if unit_used != "deg" and (has_height or role != "height") else None
-        name = source.names[column].lower().replace(" ", "_") if column is not None else ""
-        named = next((feet for ending, feet in _UNIT_ENDINGS if name.endswith(ending)), None)
-        if named is None and name.endswith(("_m", "(m)")):
-            named = "m"
+        name = source.names[column].strip() if column is not None else ""
+        below = source.units[column] if column is not None and column < len(source.units) else ""
+        found = _UNIT_ENDING.search(below.lower()) or (_UNIT_ENDING.search(name.lower()[:_MAX_NAME]) if name else None)
+        named = _UNITS_NAMED.get(found.lastgroup or "", found[found.lastgroup or 0]) if found else None
         if named is not None and unit_used not in named.split(" or "):
             message = f"the column {name} is named in {named}, its values are read as {unit_used}"
             member = "height_unit" if role == "height" else "unit"
             changes = (Change(member, named),) if named in METRES else ()
-            cure = f"declare unit or height_unit {named}"
+            is_known = not set(named.split(" or ")).isdisjoint(METRES)
+            cure = f"declare {member} {named}" if is_known else f"write the column in {', '.join(METRES)}"
             faults.append(Fault(None, role, "unit_in_header", message, cure, Severity.REFUSED, changes))
     return faults
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, overload
 
 import numpy as np
 
+from app.geodesy.systems import HeightSystem
 from app.values import Bools, Floats
 
 MAX_ROWS = 1_000_000
@@ -196,6 +197,8 @@ class SourceTable:
     faults: Faults = field(default_factory=Faults)
     detected: tuple[Detected, ...] = ()
     has_names: bool = True  # whether the names are the file's own; those of a layout by position are not
+    heights: HeightSystem | None = None  # what the heights are above, where the file's CRS states it
+    units: tuple[str, ...] = ()  # one a name, where a row of units follows the header
 
     @property
     def rows(self) -> int:
@@ -226,6 +229,7 @@ class SurveyTable:
     detected: tuple[Detected, ...] = ()  # what was not declared
     # coordinates as the file has them, where `first` and `second` are others
     written: tuple[Floats, Floats] | None = None
+    vertical_datum: str | None = None  # of the heights: declared, or that of the file's CRS
 
     @property
     def rows(self) -> int:

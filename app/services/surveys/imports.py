@@ -7,7 +7,7 @@ whether anything is, follows from the faults of each row.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -119,6 +119,9 @@ class Imports:
         table = self._processes.run(
             read_survey_file, given.file, given.declaration, _code_form(given), wait_s=_BUSY_WAIT_S
         )
+        if table.vertical_datum != given.declaration.vertical_datum:  # that of the file's CRS
+            known = given.declaration.model_copy(update={"vertical_datum": table.vertical_datum})
+            given = replace(given, declaration=known)
         table, grid = apply_local_grid(table, given.declaration)
         table = without_rows(table, given.declaration.leave_out)
         survey = georeference_survey(table, given.declaration, self._rules.crs_accuracy_m)

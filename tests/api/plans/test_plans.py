@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import httpx
 import pytest
-from pyproj import Geod
+from pyproj import CRS, Geod, Transformer
 
 from tests.conftest import LiveServer
 from tests.http import WITHIN_S, created, refused
@@ -303,6 +303,26 @@ def test_stakeout_and_exports_lie_on_the_axis_that_was_sent(
     assert realization in system.attrib["desc"]
     exported = sorted((float(e), float(n)) for n, e in (str(p.text).split() for p in document.iter(f"{space}CgPoint")))
     assert exported == [pytest.approx(at, abs=2e-4) for at in sorted(points.values())]
+    offsets = itertools.cycle([(1.5, -0.7), (-0.4, 1.2), (0.003, 0.8), (-1.1, -1.6)])  # [m] along the grid
+    pairs = zip(points.items(), offsets, strict=False)
+    built = {name: (e + de / unit_m, n + dn / unit_m) for (name, (e, n)), (de, dn) in pairs}
+    rows = "".join(f"{name},{n:.5f},{e:.5f},,built\n" for name, (e, n) in built.items())
+    declaration = {
+        "layout": "pnezd", "crs": crs, "realization": realization, "epoch": 2026.4, "compare": True,
+        "match": "nearest", "tolerance_m": 5.0, "dry_run": True,
+    }  # fmt: skip
+    form = {"declaration": json.dumps(declaration)}
+    answer = client.post("/v1/imports", files={"file": ("as-built.csv", rows.encode())}, data=form)
+    assert answer.status_code == 200, answer.text
+    residuals = answer.json()["comparison"]["residuals"]
+    assert len(residuals) == len(points)
+    degrees = Transformer.from_crs(crs, CRS(crs).geodetic_crs, always_xy=True)
+    for residual, name in zip(residuals, points, strict=True):
+        azimuth_deg, _, length_m = Geod(ellps="GRS80").inv(
+            *degrees.transform(*points[name]), *degrees.transform(*built[name])
+        )
+        expected = length_m * math.sin(math.radians(azimuth_deg)), length_m * math.cos(math.radians(azimuth_deg))
+        assert (residual["east_m"], residual["north_m"]) == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_road_with_its_own_stations_has_them_everywhere(client: httpx.Client, other_planner: httpx.Client) -> None:

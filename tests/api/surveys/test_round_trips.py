@@ -1,11 +1,14 @@
-"""Coordinates come out of the registry as they went in: 25 systems, in every format that can carry them."""
+"""Coordinates come out of the registry as they went in: 26 systems, in every format that can carry them."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import re
+import struct
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -19,9 +22,12 @@ from pyarrow import parquet
 from pyogrio import raw
 from pyproj import CRS, Transformer
 
+from app.errors import ReferenceSystemError
+from app.formats.exports import ExportFrame, frame_records
 from app.formats.surveys.coordinates import crs_unit
 from app.formats.surveys.declaration import METRES
-from app.geodesy import reference_system
+from app.geodesy import place_position, reference_system, use_grids
+from app.geodesy.place import _height_transformer, heights_above
 from app.values import Floats
 from tests.machine import require_tool
 
@@ -44,6 +50,7 @@ SYSTEMS = (
     Declared("EPSG:31370"),  # Belgium
     Declared("EPSG:2056"),  # Switzerland
     Declared("EPSG:31256"),  # Austria
+    Declared("EPSG:31287"),  # Austria, one cone for the whole country
     Declared("EPSG:2180", "ETRF2000-PL", 2026.0),  # Poland
     Declared("EPSG:2178"),  # Poland, with the zone in the eastings
     Declared("EPSG:5514"),  # Czechia, axes to the south and west
@@ -272,3 +279,243 @@ def test_kml_is_in_wgs_84_and_landxml_is_projected(client: httpx.Client) -> None
     imported(client, declared, places(declared.crs), "a road")
     for kind, crs in (("kml", "EPSG:25832"), ("landxml", "EPSG:4258"), ("dxf", "EPSG:4258")):
         assert client.get(f"/v1/exports/{kind}", params={"crs": crs}).json()["field"] == "crs"
+
+
+GEOGRAPHIC = (
+    Declared("EPSG:4979", "ITRF2014", 2026.4),  # longitude, latitude and height
+    Declared("EPSG:4326", "ITRF2014", 2026.4),
+    Declared("EPSG:4258", "ETRF2000", 2026.4),
+    Declared("EPSG:7912", None, 2026.4),
+    Declared("OGC:CRS84", "ITRF2014", 2026.4),
+)
+AGAIN = ("csv", "geojson", "gpkg", "shapefile", "landxml", "dxf")
+"""Formats of exports that surveys are read in, with their heights."""
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [*GEOGRAPHIC, *(one for one in SYSTEMS if one.crs in (
+        "EPSG:25832", "EPSG:2154", "EPSG:27700", "EPSG:2056", "EPSG:31287", "EPSG:2180", "EPSG:5514", "EPSG:6539",
+        "EPSG:2992", "EPSG:6677",
+    ))],
+    ids=lambda declared: declared.crs,
+)  # fmt: skip
+def test_an_export_is_imported_again(client: httpx.Client, declared: Declared) -> None:
+    """With the same declaration: at the same place to 0.1 mm, and LandXML, which has four decimals, to 1 mm."""
+    is_projected = reference_system(declared.crs).is_projected
+    unit_m = METRES[crs_unit(reference_system(declared.crs))] if is_projected else 111_000.0
+    degrees = np.array([(8.4164123451, 49.0051, 130.0), (8.4165123, 49.00523, 131.25), (8.41663, 49.0054, 127.5)])
+    table = places(declared.crs) if is_projected else degrees
+    declaration = {
+        "family": "cerpm", "vertical_datum": "ellipsoid",
+        **{name: value for name, value in declared._asdict().items() if value is not None},
+    }  # fmt: skip
+    names = "easting,northing" if is_projected else "lon,lat"
+    lines = [f"{k},{x!r},{y!r},{z!r}" for k, (x, y, z) in enumerate(table.tolist(), 1)]
+    data = "\n".join([f"number,{names},height", *lines]).encode()
+    first = {**declaration, "columns": {"code": "number"}, "road": "survey", "height_unit": "m"}
+    answer = client.post("/v1/imports", files={"file": ("a.csv", data)}, data={"declaration": json.dumps(first)})
+    assert answer.status_code == 201, answer.text
+    for kind in AGAIN:
+        if not is_projected and kind in ("landxml", "dxf"):
+            continue
+        exported = client.get(f"/v1/exports/{kind}", params={"road": "survey", "crs": declared.crs})
+        assert exported.status_code == 200, exported.text
+        again = {**declaration, "road": kind, "columns": {"code": None, "road": None}, "duplicates": "store"}
+        if kind not in ("landxml", "dxf") and unit_m != 1.0 and is_projected:
+            again["height_unit"] = "m"
+        form = {"declaration": json.dumps(again)}
+        answer = client.post("/v1/imports", files={"file": (kind, exported.content)}, data=form)
+        assert answer.status_code == 201, f"{kind}: {answer.text}"
+        rows = csv.DictReader(
+            io.StringIO(client.get("/v1/exports/csv", params={"road": kind, "crs": declared.crs}).text)
+        )
+        found = np.array(sorted((float(row["x"]), float(row["y"]), float(row["z_m"])) for row in rows))
+        away_mm = np.abs(found - table[np.argsort(table[:, 0])]) * [unit_m * 1000, unit_m * 1000, 1000]
+        assert away_mm.max() < (LIMIT_MM if kind == "landxml" else 0.1), (kind, away_mm)
+
+
+def test_kml_is_imported_again(client: httpx.Client) -> None:
+    """In WGS 84 and without heights, also where a WGS 84 with heights is declared."""
+    declared = Declared("EPSG:4979", "ITRF2014", 2026.4)
+    data = b"number,lon,lat\n1,8.4164123451,49.0051\n2,8.4165123,49.00523\n"
+    declaration = {"family": "cerpm", **declared._asdict(), "columns": {"code": None, "road": None}, "road": "a"}
+    form = {"declaration": json.dumps(declaration)}
+    assert client.post("/v1/imports", files={"file": ("a.csv", data)}, data=form).status_code == 201
+    content = client.get("/v1/exports/kml").content
+    form = {"declaration": json.dumps({**declaration, "road": "b", "duplicates": "store"})}
+    answer = client.post("/v1/imports", files={"file": ("a.kml", content)}, data=form)
+    assert answer.status_code == 201, answer.text
+    roads = [
+        sorted((float(row["lon_deg"]), float(row["lat_deg"])) for row in csv.DictReader(io.StringIO(text)))
+        for text in (client.get("/v1/exports/csv", params={"road": road}).text for road in ("a", "b"))
+    ]
+    assert np.array(roads[0]) == pytest.approx(np.array(roads[1]), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("crs", "lon_deg", "lat_deg", "grid"),
+    [
+        ("EPSG:27700", -1.5, 52.5, "uk_os_OSTN15_NTv2_OSGBtoETRS.tif"),
+        ("EPSG:31287", 14.3, 48.2, "at_bev_AT_GIS_GRID_2021_09_28.tif"),
+        ("EPSG:5514", 15.5, 49.8, None),
+    ],
+)
+def test_a_system_without_an_accurate_transformation_is_refused_with_the_reason(
+    client: httpx.Client, crs: str, lon_deg: float, lat_deg: float, grid: str | None
+) -> None:
+    marker = {
+        "family": "cerpm", "side": "left",
+        "position": {"lon_deg": lon_deg, "lat_deg": lat_deg, "realization": "ITRF2014", "epoch": 2026.4},
+    }  # fmt: skip
+    assert client.post("/v1/markers", json=marker).status_code == 201
+    problem = client.get("/v1/exports/csv", params={"crs": crs}).json()
+    assert re.search(r"at most 0.2 m to ITRF2014 is available: '.*' states [0-9.]+ m", problem["detail"]), problem
+    assert problem["cure"].startswith(f"projsync --file {grid} " if grid else "choose a system on WGS 84"), problem
+
+
+@pytest.mark.parametrize(("crs", "lon_deg", "lat_deg"), [("EPSG:2056", 8.2, 46.9), ("EPSG:2154", 2.3, 48.8)])
+def test_a_system_is_reached_by_way_of_etrs89(client: httpx.Client, crs: str, lon_deg: float, lat_deg: float) -> None:
+    """PROJ relates LV95 and Lambert-93 to ETRS89 within 0.1 m, and ETRS89 to ITRF2014 within 0.1 m."""
+    position = {"lon_deg": lon_deg, "lat_deg": lat_deg, "realization": "ITRF2014", "epoch": 2026.4}
+    marker = {"family": "cerpm", "side": "left", "position": position}
+    assert client.post("/v1/markers", json=marker).status_code == 201
+    answer = client.get("/v1/exports/csv", params={"crs": crs})
+    row = next(csv.DictReader(io.StringIO(answer.text)))
+    etrf = Transformer.from_crs("EPSG:9000", "EPSG:9069", always_xy=True)  # ETRF2014
+    base = Transformer.from_crs("EPSG:4258", CRS(crs).geodetic_crs, always_xy=True, allow_ballpark=False)
+    project = Transformer.from_crs(CRS(crs).geodetic_crs, crs, always_xy=True)
+    expected = project.transform(*base.transform(*etrf.transform(lon_deg, lat_deg, 0.0, 2026.4)[:2]))
+    assert (float(row["x"]), float(row["y"])) == pytest.approx(expected, abs=0.1)
+
+
+def test_a_local_grid_comes_back_by_an_independent_similarity(client: httpx.Client, tmp_path: Path) -> None:
+    """Least squares of its four parameters by numpy: shift, rotation and scale of a site's grid."""
+    rng = np.random.default_rng(3)
+    local = np.round(np.array([(1000.0, 2000.0), (1310.5, 2020.2), (1280.1, 2400.7), (990.3, 2380.9)]), 4)
+    turn, scale = np.radians(31.7), 1.00021
+    turned = scale * (local - local[0]) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    known = np.round(turned + np.array([457_000.0, 5_428_000.0]) + rng.normal(0, 0.004, local.shape), 4)
+    points = np.round(np.array([(1050.0, 2100.0), (1100.25, 2150.5), (1200.125, 2301.75)]), 4)
+    controls = [
+        {"point": f"C{k}", "easting": e, "northing": n, "local_easting": x, "local_northing": y}
+        for k, ((e, n), (x, y)) in enumerate(zip(known.tolist(), local.tolist(), strict=True))
+    ]
+    declaration = {
+        "family": "cerpm", "columns": {"code": "number"}, "crs": "EPSG:25832", "realization": "ETRF2000",
+        "epoch": 2026.4, "local_grid": {"control_points": controls, "scale": "free"}, "road": "site",
+    }  # fmt: skip
+    lines = [f"{k},{x},{y}" for k, (x, y) in enumerate(points.tolist(), 1)]
+    data = "\n".join(["number,easting,northing", *lines]).encode()
+    form = {"declaration": json.dumps(declaration)}
+    answer = client.post("/v1/imports", files={"file": ("a.csv", data)}, data=form)
+    assert answer.status_code == 201, answer.text
+    equations = np.array([row for x, y in local.tolist() for row in ((x, -y, 1, 0), (y, x, 0, 1))])
+    a, b, east, north = np.linalg.lstsq(equations, known.ravel(), rcond=None)[0]
+    x, y = points.T
+    expected = np.column_stack([a * x - b * y + east, b * x + a * y + north])
+    content = client.get("/v1/exports/csv", params={"crs": "EPSG:25832"}).text
+    rows = sorted(csv.DictReader(io.StringIO(content)), key=lambda row: int(row["code"]))
+    found = np.array([(float(row["x"]), float(row["y"])) for row in rows])
+    assert found == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_compound_system_comes_back_with_its_heights(client: httpx.Client) -> None:
+    table = places("EPSG:25832")
+    declaration = {"family": "cerpm", "columns": {"code": "number"}, "crs": "EPSG:5555", "road": "a road"}
+    form = {"declaration": json.dumps({**declaration, "realization": "ETRF2000", "epoch": 2026.4})}
+    answer = client.post("/v1/imports", files={"file": ("a.csv", survey(table, 1))}, data=form)
+    assert answer.status_code == 201, answer.text
+    rows = list(csv.DictReader(io.StringIO(client.get("/v1/exports/csv", params={"crs": "EPSG:25832"}).text)))
+    found = np.array(sorted((int(row["code"]), float(row["x"]), float(row["y"]), float(row["z_m"])) for row in rows))
+    assert found[:, 1:] == pytest.approx(table, abs=1e-4)
+    assert {row["geometry_vertical_datum"] for row in rows} == {"EPSG:5783"}
+    declaration |= {"vertical_datum": "ellipsoid", "duplicates": "store"}
+    form = {"declaration": json.dumps(declaration)}
+    problem = client.post("/v1/imports", files={"file": ("a.csv", survey(table, 9))}, data=form).json()
+    assert "EPSG:5783" in str(problem), problem
+
+
+@pytest.mark.parametrize("declared", [SYSTEMS[0], SYSTEMS[17]], ids=lambda declared: declared.crs)
+def test_heights_come_back_where_some_rows_have_none(client: httpx.Client, declared: Declared) -> None:
+    """Of NAD83(2011) they are 1.3 m from those in the ITRF: before, they were kept where one row had none."""
+    table = places(declared.crs)
+    lines = survey(table, 1).decode().splitlines()
+    lines[2] = lines[2].rpartition(",")[0] + ","
+    declaration = {"family": "cerpm", "columns": {"code": "number"}, "vertical_datum": "ellipsoid", "height_unit": "m"}
+    form = {"declaration": json.dumps({**declaration, **declared._asdict(), "road": "a road"})}
+    answer = client.post("/v1/imports", files={"file": ("a.csv", "\n".join(lines).encode())}, data=form)
+    assert answer.status_code == 201, answer.text
+    place = client.get("/v1/markers").json()["items"]
+    lon, lat = place[0]["position"]["lon_deg"], place[0]["position"]["lat_deg"]
+    box = f"{lon - 1e-6},{lat - 1e-6},{lon + 1e-6},{lat + 1e-6}"
+    for asked in ({"road": "a road"}, {"bbox": box}):
+        content = client.get("/v1/exports/csv", params={"crs": declared.crs, **asked}).text
+        for row in csv.DictReader(io.StringIO(content)):
+            x, y, z = table[int(row["code"]) - 1].tolist()
+            assert (float(row["x"]), float(row["y"])) == pytest.approx((x, y), abs=2e-4)
+            assert row["z_m"] == "" if row["code"] == "2" else float(row["z_m"]) == pytest.approx(z, abs=1e-3)
+
+
+UNDULATION_M = 48.25
+"""Constant value of the grid. [m]"""
+
+
+def geotiff(value: float, *, west: float, north: float, shape: tuple[int, int]) -> bytes:
+    """A GeoTIFF 1.1 with one value at all points of a grid of one degree in ETRS89."""
+    rows, columns = shape
+    data = struct.pack("<f", value) * (rows * columns)
+    doubles = struct.pack("<9d", 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, west, north, 0.0)  # size of a pixel, place of the first
+    keys = struct.pack("<16H", 1, 1, 0, 3, 1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4258)
+    behind = 8 + 2 + 14 * 12 + 4
+    first = behind + len(doubles) + len(keys)
+    entries = (
+        (256, 4, 1, columns), (257, 4, 1, rows), (258, 3, 1, 32), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, first),
+        (277, 3, 1, 1), (278, 4, 1, rows), (279, 4, 1, len(data)), (284, 3, 1, 1), (339, 3, 1, 3),
+        (33550, 12, 3, behind), (33922, 12, 6, behind + 24), (34735, 3, 16, behind + len(doubles)),
+    )  # fmt: skip
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries))
+    return head + b"".join(struct.pack("<HHII", *entry) for entry in entries) + bytes(4) + doubles + keys + data
+
+
+@pytest.fixture
+def quasigeoid(tmp_path: Path) -> Iterator[None]:
+    """A GeoTIFF with the name of the German quasigeoid's grid, and one value."""
+    (tmp_path / "de_bkg_gcg2016.tif").write_bytes(geotiff(UNDULATION_M, west=5.0, north=56.0, shape=(10, 12)))
+    use_grids(tmp_path)
+    yield
+    use_grids(None)
+    _height_transformer.cache_clear()
+
+
+@pytest.mark.usefixtures("quasigeoid")
+@pytest.mark.parametrize(("own", "asked", "sign"), [("EPSG:7837", "ellipsoid", 1), ("ellipsoid", "EPSG:7837", -1)])
+def test_heights_are_transformed_with_a_grid(own: str, asked: str, sign: int) -> None:
+    """From heights above the quasigeoid to heights above the ellipsoid of ETRS89, and back."""
+    height_m, realization, epoch = 112.345, "ETRF2000", 2026.4
+    placed = place_position(
+        457_000.0, 5_428_000.0, height_m, crs="EPSG:25832", projected=True, realization=realization, epoch=epoch,
+        ellipsoidal_height=own == "ellipsoid",
+    )  # fmt: skip
+    record = {
+        "lon_deg": placed.lon_deg, "lat_deg": placed.lat_deg, "height_m": placed.height_m, "vertical_datum": own,
+        "epoch": placed.epoch, "origin_crs": "EPSG:25832", "origin_realization": realization,
+        "transform_accuracy_m": placed.transform_accuracy_m,
+    }  # fmt: skip
+    (framed,), problem = frame_records([record], ExportFrame("EPSG:25832", vertical_datum=asked))
+    assert problem is None
+    assert (framed["x"], framed["y"]) == pytest.approx((457_000.0, 5_428_000.0), abs=1e-4)
+    assert framed["z_m"] == pytest.approx(height_m + sign * UNDULATION_M, abs=1e-3)
+    assert framed["geometry_vertical_datum"] == asked
+    (same,), _ = frame_records([record], ExportFrame("EPSG:25832"))
+    assert same["z_m"] == pytest.approx(height_m, abs=1e-4)
+
+
+def test_a_grid_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    (tmp_path / "us_nga_egm96_15.tif").write_bytes(b"no grid")
+    use_grids(tmp_path)
+    try:
+        with pytest.raises(ReferenceSystemError, match=r"EPSG:5773 .* is installed, but cannot be read"):
+            heights_above(*np.array([[8.4], [49.0], [112.0]]), "EPSG:32632", "ellipsoid", "EPSG:5773")
+    finally:
+        use_grids(None)
