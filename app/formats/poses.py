@@ -83,6 +83,11 @@ class PoseDeclaration(Declaration):
         """How its times are read."""
         return self.clock or LogClock()
 
+    @property
+    def frame_times(self) -> LogClock:
+        """How times of a list of frames or of pictures are read: `offset_s` corrects the track's clock only."""
+        return self.times.model_copy(update={"offset_s": 0.0})
+
 
 @dataclass(frozen=True, slots=True)
 class PoseLimits:

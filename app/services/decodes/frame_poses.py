@@ -176,7 +176,7 @@ class FramePlaces:
             return captured_at + timedelta(seconds=ordinal / self._frames.rate_hz) if captured_at else None
         if taken is None:
             return None
-        clock = self._frames.track.times
+        clock = self._frames.track.frame_times
         if not has_zone(taken) and not clock.utc_offset_s:
             self._warn("times of the pictures' EXIF without a zone were taken as UTC; declare frames.poses.clock")
         time_s = clock.read(taken)

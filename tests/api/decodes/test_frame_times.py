@@ -92,6 +92,13 @@ def test_a_track_a_week_rollover_behind_is_warned_of(client: httpx.Client, plate
     decode = wait_for(client, post_frame(client, archive, context, name="d.zip").headers["location"])
     assert decode["warnings"] == []
     assert decode["frames"][0]["pose"]["source"] == "track"
+    listed = pack(
+        {"0.png": GOOD, "frames.csv": b"name,time\n0.png,2026-05-04T08:30:01Z\n", "poses.csv": track.encode()}
+    )
+    context = {"frames": {"poses": context["frames"]["poses"]}}
+    decode = wait_for(client, post_frame(client, listed, context, name="d.zip").headers["location"])
+    assert decode["frames"][0]["captured_at"] == "2026-05-04T08:30:01Z", "the list has its own clock"
+    assert decode["frames"][0]["pose"]["source"] == "track"
 
 
 def test_frames_outside_the_times_of_their_track_are_reported(client: httpx.Client, plate: dict[str, Any]) -> None:
