@@ -94,7 +94,9 @@ def read_frame_list(name: str, data: bytes, declaration: PoseDeclaration | None 
     read_rows = _json_rows if name.lower().endswith(".json") else _csv_rows
     rows = list(read_rows(name, data, declaration))
     texts = (str(values.get("time", "")) for _entry, values in rows if values is not None)
-    clock = declaration.frame_times.of_column(texts, "poses.clock.day_first")
+    is_track = any(values is not None and "lon" in values and "lat" in values for _entry, values in rows)
+    times = declaration.times if is_track else declaration.frame_times
+    clock = times.of_column(texts, "poses.clock.day_first")
     listed: dict[str, ListedFrame] = {}
     seen: set[str] = set()
     for entry, values in rows:

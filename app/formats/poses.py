@@ -85,7 +85,7 @@ class PoseDeclaration(Declaration):
 
     @property
     def frame_times(self) -> LogClock:
-        """How times of a list of frames or of pictures are read: `offset_s` corrects the track's clock only."""
+        """How times of pictures, and of a list of them without positions, are read: `offset_s` is of the track."""
         return self.times.model_copy(update={"offset_s": 0.0})
 
 
