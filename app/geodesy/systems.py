@@ -468,9 +468,22 @@ def split_heights(crs: str) -> tuple[str, HeightSystem | None]:
     return name_system(horizontal) or horizontal.to_wkt(), _height_system(vertical)
 
 
+_NO_DATUM = re.compile(r"unknown|unnamed|undefined|not[ _]specified|.*based on", re.IGNORECASE)
+_GEOCENTRIC_ELLIPSOIDS = ("GRS 1980", "WGS 84")
+"""Ellipsoids whose datums lie within 2 m of each other; those of the others lie a hundred metres apart."""
+
+
+def has_datum(system: CRS) -> bool:
+    """Whether a system states a datum, not only an ellipsoid that several datums of a continent have."""
+    geodetic = system.geodetic_crs
+    if geodetic is None or geodetic.datum is None or geodetic.ellipsoid is None:
+        return False
+    return geodetic.ellipsoid.name in _GEOCENTRIC_ELLIPSOIDS or _NO_DATUM.match(geodetic.datum.name) is None
+
+
 def name_system(system: CRS) -> str | None:
     """``EPSG:code`` of a system that was read as WKT; None if the EPSG registry does not list it."""
-    code = system.to_epsg(min_confidence=70)
+    code = system.to_epsg(min_confidence=70) if has_datum(system) else None
     if code is not None:
         return f"EPSG:{code}"
     is_plain = system.is_geographic and not system.is_compound and not system.is_bound

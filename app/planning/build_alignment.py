@@ -116,7 +116,7 @@ def build_alignment(
         source.crs,
         source.realization,
         source.epoch,
-        declaration.vertical_datum if has_heights else None,
+        reference.declaration.vertical_datum if has_heights else None,
         source.transform_accuracy_m,
         declaration.realization,
         file.stationing,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from datetime import datetime
-from typing import NamedTuple
+from typing import NamedTuple, NotRequired
 
 import sqlalchemy as sa
 from typing_extensions import TypedDict
@@ -61,6 +61,9 @@ class RoadFrame(TypedDict):
     epoch: float | None
     transform_accuracy_m: float | None
     several: bool
+    # as they were sent; roads that were registered by earlier releases have neither
+    declared_realization: NotRequired[str | None]
+    declared_epoch: NotRequired[float | None]
 
 
 class StoredStation(TypedDict):

@@ -358,7 +358,7 @@ def _equations(writer: _Writer, start: float, length_m: float) -> tuple[tuple[St
         at = float(internal) - start if form != 0 else before + sign * (float(back_text) - ahead)
         back = float(back_text) if form != 1 else ahead + sign * (at - before)
         before, ahead, sign = at, float(ahead_text), -1.0 if increment == "decreasing" else 1.0
-        found.append(StationEquation(at * unit_m, back * unit_m, ahead * unit_m, increment == "decreasing"))
+        found.append(StationEquation(at * unit_m, back * unit_m, ahead * unit_m, sign))
     return tuple(found), "".join(texts)
 
 
@@ -459,7 +459,7 @@ def _compare(file: AlignmentFile, found: Sequence[_Alignment], writer: _Writer, 
             return f"{len(stationing.equations)} station equations of {len(alignment.equations)}"
         for one, two in zip(stationing.equations, alignment.equations, strict=True):
             pairs = ((one.distance_m, two.distance_m), (one.back_m, two.back_m), (one.ahead_m, two.ahead_m))
-            if max(abs(a - b) for a, b in pairs) > 1e-6 or one.falls != two.falls:
+            if max(abs(a - b) for a, b in pairs) > 1e-6 or one.rate != two.rate:
                 return f"the station equation is {one}, not {two}"
         if problem := _compare_lane(lane, alignment, writer):
             return f"alignment {alignment.name}: {problem}"

@@ -404,15 +404,23 @@ def _other_box(name: str, low: Sides, high: Sides, crs: OtherCrs) -> list[shapel
     width, height = high[0] - low[0], high[1] - low[1]
     if not (width and height):
         refuse(name, "a box has no width or no height", "lower corner, upper corner")
-    box = shapely.segmentize(shapely.box(*low, *high), max(width, height) / _BOX_PARTS)
-    turned = in_lon_lat(box, crs)
-    lon_deg = shapely.get_coordinates(turned)[:, 0]
+    inside = crs.within_area((low[0], low[1]), (high[0], high[1]))
+    if inside is None:
+        refuse(name, f"a box lies outside the area of {crs.name}", "a box in the area of its CRS")
+    (west, south), (east, north) = inside
+    box = shapely.box(west, south, east, north)
+    turned = in_lon_lat(shapely.segmentize(box, max(east - west, north - south) / _BOX_PARTS), crs)
     if not np.isfinite(shapely.get_coordinates(turned)).all():
         refuse(name, f"a box lies outside the area of {crs.name}", "a box in the area of its CRS")
-    if np.abs(np.diff(lon_deg)).max() <= 180.0:
+    lon_deg = shapely.get_coordinates(turned)[:, 0]
+    is_over_antimeridian = np.abs(np.diff(lon_deg)).max() > 180.0
+    if is_over_antimeridian:
+        turned = shapely.transform(turned, lambda at: np.where([True, False] & (at < 0.0), at + 360.0, at))
+    if not turned.is_valid:  # about a pole, or over much of the earth: a box round it
+        return [_shape_of(part) for part in _on_earth(*crs.bounds_deg(*inside)).parts]
+    if not is_over_antimeridian:
         return [turned]
-    east = shapely.transform(turned, lambda at: np.where([True, False] & (at < 0.0), at + 360.0, at))
-    halves = [shapely.clip_by_rect(east, 0, -90, 180, 90), shapely.clip_by_rect(east, 180, -90, 360, 90)]
+    halves = [shapely.clip_by_rect(turned, 0, -90, 180, 90), shapely.clip_by_rect(turned, 180, -90, 360, 90)]
     back = shapely.transform(halves[1], lambda at: at - [360.0, 0.0])
     return [half for half in (halves[0], back) if not half.is_empty]
 

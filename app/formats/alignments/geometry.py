@@ -110,7 +110,7 @@ class StationEquation:
     # `back_m`, `ahead_m`: [m] displayed stations before and after
     back_m: float
     ahead_m: float
-    falls: bool = False  # whether displayed stations fall from there on
+    rate: float = 1.0  # [1] displayed metres in a metre from there on; negative where stations fall
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class Stationing:
         if number == 0:
             return self.start_m + distance_m
         last = self.equations[number - 1]
-        return last.ahead_m + (-1 if last.falls else 1) * (distance_m - last.distance_m)
+        return last.ahead_m + last.rate * (distance_m - last.distance_m)
 
 
 @dataclass(frozen=True, slots=True)

@@ -510,9 +510,8 @@ def _equations(
         if not (distance <= at and at * scale.unit_m <= length_m + GAP_M):
             warnings.append(f"{where}: it lies outside the line, or before the one before; it is left out.")
             continue
-        falls = element.get("staIncrement") == "decreasing"
-        distance, ahead, sign = at, new_ahead, -1.0 if falls else 1.0
-        found.append(StationEquation(at * scale.unit_m, back * scale.unit_m, new_ahead * scale.unit_m, falls))
+        distance, ahead, sign = at, new_ahead, -1.0 if element.get("staIncrement") == "decreasing" else 1.0
+        found.append(StationEquation(at * scale.unit_m, back * scale.unit_m, new_ahead * scale.unit_m, sign))
     return tuple(found)
 
 

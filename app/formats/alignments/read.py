@@ -135,6 +135,7 @@ def _unreadable(message: str) -> UnreadableUpload:
 ROAD_FORMAT: Final = "waymark-road/1"
 MAX_LANES = 8
 """Lanes of one direction. Wider than any motorway."""
+_SAME_RATE = 1e-9  # [1] below a micrometre in a kilometre
 _SAME_STATION_M = 5e-4  # [m] jumps of the station that drawings do not show; source: half a millimetre
 _GEOD = Geod(ellps="WGS84")
 
@@ -262,14 +263,18 @@ def _lanes(road: RegisteredRoad, axes: list[Floats], chainages: list[Floats]) ->
 
 
 def _equations(measures: Measures) -> Iterator[StationEquation]:
-    """Where the displayed station jumps so that it is the measure again."""
-    shown_m = float(measures.sections[0].measures_m[0]) - float(measures.sections[0].chainages_m[0])
+    """Where displayed stations jump, or go on faster or slower than the road, so that they are its measures."""
+    shown = Stationing(float(measures.sections[0].measures_m[0]))
     for section in measures.sections:
-        for chainage, measure in zip(section.chainages_m[:-1].tolist(), section.measures_m[:-1].tolist(), strict=True):
-            back = shown_m + chainage
-            if abs(measure - back) > _SAME_STATION_M:
-                yield StationEquation(chainage, back, measure)
-                shown_m = measure - chainage
+        rates = np.diff(section.measures_m) / np.diff(section.chainages_m)
+        for chainage, measure, rate in zip(
+            section.chainages_m[:-1].tolist(), section.measures_m[:-1].tolist(), rates.tolist(), strict=True
+        ):
+            back, former = shown.displayed_m(chainage), shown.equations[-1].rate if shown.equations else 1.0
+            if abs(measure - back) > _SAME_STATION_M or abs(rate - former) > _SAME_RATE:
+                found = StationEquation(chainage, back, measure, rate)
+                shown = Stationing(shown.start_m, (*shown.equations[-1:], found))
+                yield found
 
 
 # === Formats of roads: how each is detected and read. Libraries of rarer formats are loaded when they are needed.

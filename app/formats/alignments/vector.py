@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import shapely
 from app.errors import ReferenceSystemError, UnreadableUpload
 from app.formats.alignments.features import RoadFeature, Shape, assemble_road, check_counts, read_ring, read_vertices
 from app.formats.alignments.geometry import AlignmentFile
-from app.formats.surveys.gis_reader import list_gpkg_layers, name_crs, plain_values, repack_shapefile
+from app.formats.surveys.gis_reader import list_gpkg_layers, name_crs, plain_values, read_prj, repack_shapefile
 from app.formats.surveys.table import MAX_COLUMNS
 
 _MAX_LAYERS = 50  # bounds the time of a file
@@ -38,7 +39,11 @@ def read_gpkg(data: bytes) -> AlignmentFile:
 
 def read_shapefile(data: bytes) -> AlignmentFile:
     """A road of the one Shapefile in a ZIP archive; errors as for `read_gpkg`."""
-    return _read("shapefile", repack_shapefile(data), [None])
+    packed = repack_shapefile(data)
+    road = _read("shapefile", packed, [None])
+    if road.crs is None and (stated := read_prj(packed)) is not None:  # GDAL reads WKT 1 alone
+        road = replace(road, crs=name_crs(stated) or stated)
+    return road
 
 
 def _read(format_name: str, data: bytes, layers: list[Any]) -> AlignmentFile:

@@ -55,7 +55,7 @@ def read_shapefile(data: bytes) -> SourceTable:
     """
     packed = repack_shapefile(data)
     table = _read("shapefile", packed, None)
-    stated = _read_prj(packed)
+    stated = read_prj(packed)
     if stated is None:
         return table
     own, heights = split_heights(stated)
@@ -65,7 +65,7 @@ def read_shapefile(data: bytes) -> SourceTable:
     return replace(table, heights=heights)
 
 
-def _read_prj(packed: bytes) -> str | None:
+def read_prj(packed: bytes) -> str | None:
     """WKT of the .prj; None if there is none that can be read."""
     with zipfile.ZipFile(io.BytesIO(packed)) as archive:
         if "survey.prj" not in archive.namelist():

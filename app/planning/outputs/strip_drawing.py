@@ -39,6 +39,7 @@ _TOLERANCE_MM = 0.03  # of lines on paper; a third of the thinnest line
 _CELL_MM = 0.4  # of the grid of taken places; a quarter of the smallest letters
 _SHARED_M = 0.3  # between edges of two lanes that are one painted line; two widths of paint
 _FROM_MATCH_MM = 7.0  # between numbered stations and match lines; half of a station's number
+_SAME_STATION_M = 0.005  # stations are written in centimetres
 _TICKS = 5  # from one numbered station to the next
 _UNITS = {EventKind.SPEED_LIMIT: " km/h", EventKind.CURVE: " deg"}
 _LIFTS_MM = (3.0, 5.5, 10.0, 13.0)  # of numbers outside the road; round the stations' numbers
@@ -297,7 +298,8 @@ class _Row:
         ends = np.array([self._at(end)[0] for end in (self.strip.from_m, self.strip.to_m)])
         for equation in reference.stationing.equations:
             at = float(np.interp(equation.distance_m, reference.distance_m, reference.along_m, -1.0, -1.0))
-            if at >= 0 and self.strip.from_m <= at <= self.strip.to_m:
+            is_jump = abs(equation.ahead_m - equation.back_m) > _SAME_STATION_M
+            if is_jump and at >= 0 and self.strip.from_m <= at <= self.strip.to_m:
                 self._draw_equation(at, equation)
         places, stations = reference.round_stations(minor)
         for k in np.flatnonzero((places >= self.strip.from_m - 1e-6) & (places <= self.strip.to_m + 1e-6)):

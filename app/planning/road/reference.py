@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -13,9 +13,9 @@ from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile
-from app.formats.surveys.declaration import METRES
+from app.formats.surveys.declaration import METRES, choose_datum
 from app.geodesy import normalize_crs, place_positions, reference_system
-from app.geodesy.systems import geographic_code, is_global
+from app.geodesy.systems import HeightSystem, geographic_code, has_datum, is_global, split_heights
 from app.values import Floats
 
 MAX_LOCAL_M = 200_000.0
@@ -27,6 +27,7 @@ _PROJ_KEYS = frozenset({
     "vto_meter", "vunits", "wktext", "x_0", "y_0", "zone",
 })  # fmt: skip
 """Other keys of PROJ strings can name files. Source: PROJ documentation, "Cartographic projection"."""
+_SAME_GRID_M = 1e-3  # [m] between the coordinates of two systems that are one grid
 _WKT = re.compile(r"\s*[A-Z][A-Z0-9_]*\s*[\[(]", re.IGNORECASE)
 _DROPPED_KEYS = ("geoidgrids", "geoid_crs")  # of heights, whose datum is declared
 _MIN_CONFIDENCE = 70  # [%] of pyproj's match with an EPSG code, as for surveys (app/formats/surveys/gis_reader.py)
@@ -138,6 +139,10 @@ def find_reference(file: AlignmentFile, declaration: AlignmentDeclaration, *, ha
         Units or the vertical datum are missing or contradict each other.
     """
     stated = _stated(file.crs) if file.crs is not None else None
+    heights = _heights_of(file.crs) if has_heights and file.crs is not None else None
+    if heights is not None:
+        datum = choose_datum(declaration.vertical_datum, heights, f"the file ({str(file.crs)[:60]})")
+        declaration = replace(declaration, vertical_datum=datum)
     if declaration.origin is not None:
         if stated is not None:
             raise ReferenceSystemError(
@@ -167,9 +172,18 @@ def find_reference(file: AlignmentFile, declaration: AlignmentDeclaration, *, ha
     system = _system(name)
     own = _unit_m(system)
     if has_heights:
-        _check_heights(file, declaration, own)
+        _check_heights(file, declaration, own, heights)
     unit = own if system.is_geographic else _unit(file, declaration, own)
-    return RoadReference(name, bool(system.is_geographic), unit, _height_unit(declaration, unit), declaration)
+    of_heights = unit if heights is None or file.unit_m is not None else heights.unit_m
+    return RoadReference(name, bool(system.is_geographic), unit, _height_unit(declaration, of_heights), declaration)
+
+
+def _heights_of(crs: str) -> HeightSystem | None:
+    """What the CRS that a file states says about heights; PROJ strings say nothing that is used."""
+    try:
+        return split_heights(crs)[1]
+    except ReferenceSystemError:
+        return None
 
 
 def _stated(crs: str) -> str:
@@ -180,7 +194,8 @@ def _stated(crs: str) -> str:
             return name
     except (ReferenceSystemError, CRSError):
         name = crs
-    code = _horizontal(name).to_epsg(min_confidence=_MIN_CONFIDENCE)
+    system = _horizontal(name)
+    code = system.to_epsg(min_confidence=_MIN_CONFIDENCE) if has_datum(system) else None
     return f"EPSG:{code}" if code is not None else name
 
 
@@ -232,7 +247,28 @@ def _unusable(name: str, why: str) -> ReferenceSystemError:
 def _are_same(stated: str, declared: str) -> bool:
     if stated == declared or {stated, declared} == {_CRS84, "EPSG:4326"}:
         return True
-    return not _has_code(stated) and bool(_system(stated).equals(_system(declared), ignore_axis_order=True))
+    if _has_code(stated):
+        return False
+    one, other = _system(stated), _system(declared)
+    return bool(one.equals(other, ignore_axis_order=True)) or (not has_datum(one) and _have_same_grid(one, other))
+
+
+def _have_same_grid(one: CRS, other: CRS) -> bool:
+    """Whether two systems differ in nothing but their datums: the declared one says which datum the file is in."""
+    if one.is_projected != other.is_projected or one.ellipsoid != other.ellipsoid:
+        return False
+    if not one.is_projected:
+        return True
+    area = other.area_of_use
+    if area is None or one.geodetic_crs is None or other.geodetic_crs is None:
+        return False
+    lon = np.array([area.west, area.east if area.east > area.west else area.west])
+    lat = np.array([area.south, area.north])
+    grids = [
+        np.array(Transformer.from_crs(system.geodetic_crs, system, always_xy=True).transform(lon, lat))
+        for system in (one, other)
+    ]
+    return bool(np.isfinite(grids).all() and np.abs(grids[0] - grids[1]).max() < _SAME_GRID_M)
 
 
 def _to_geographic(name: str, first: Floats, second: Floats) -> tuple[Floats, Floats, str, str | None]:
@@ -289,7 +325,9 @@ def _height_unit(declaration: AlignmentDeclaration, unit_m: float) -> float:
     return METRES[declaration.height_unit] if declaration.height_unit is not None else unit_m
 
 
-def _check_heights(file: AlignmentFile, declaration: AlignmentDeclaration, own_m: float) -> None:
+def _check_heights(
+    file: AlignmentFile, declaration: AlignmentDeclaration, own_m: float, heights: HeightSystem | None
+) -> None:
     if declaration.vertical_datum is None:
         raise InvalidParameter(
             "the file has heights, and their vertical datum is not declared",
@@ -297,7 +335,8 @@ def _check_heights(file: AlignmentFile, declaration: AlignmentDeclaration, own_m
             limit="ellipsoid, or the datum, e.g. EPSG:5703",
             cure="declare vertical_datum, or ignore_heights to leave them out",
         )
-    if own_m != 1.0 and file.unit_m is None and declaration.unit is None and declaration.height_unit is None:
+    is_stated = heights is not None or file.unit_m is not None
+    if own_m != 1.0 and not is_stated and declaration.unit is None and declaration.height_unit is None:
         raise InvalidParameter(
             "the unit of the heights is not declared",
             field="height_unit",

@@ -21,6 +21,7 @@ import orjson
 import shapely
 import sqlalchemy as sa
 from pyproj.enums import TransformDirection
+from pyproj.exceptions import ProjError
 
 from app.errors import NotFound
 from app.families import FAMILIES
@@ -103,10 +104,45 @@ class OtherCrs:
         """``EPSG:code``."""
         return f"EPSG:{self.uri.removeprefix(EPSG_URI)}"
 
+    def within_area(
+        self, low: tuple[float, float], high: tuple[float, float]
+    ) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """A box without what lies outside the system's area, where it places nothing; None if that is all of it."""
+        bounds = _area_bounds(self.name)
+        if bounds is None:
+            return low, high
+        west, south, east, north = bounds
+        first, last = ((south, west), (north, east)) if self.is_north_first else ((west, south), (east, north))
+        low = max(low[0], first[0]), max(low[1], first[1])
+        high = min(high[0], last[0]), min(high[1], last[1])
+        return (low, high) if low[0] < high[0] and low[1] < high[1] else None
+
+    def bounds_deg(self, low: tuple[float, float], high: tuple[float, float]) -> tuple[float, float, float, float]:
+        """West, south, east and north of a box; west is greater across the antimeridian."""
+        if self.is_north_first:
+            low, high = low[::-1], high[::-1]
+        west, south, east, north = best_effort(self.name).transform_bounds(*low, *high)
+        return west, south, east, north
+
     @property
     def is_north_first(self) -> bool:
         """Whether the authority's first axis points to the north, and the second one to the east."""
         return [axis.direction for axis in reference_system(self.name).axis_info[:2]] == ["north", "east"]
+
+
+@lru_cache(maxsize=256)
+def _area_bounds(name: str) -> tuple[float, float, float, float] | None:
+    """Lowest easting and northing and highest ones of a system's area of use; None where that has no such bounds."""
+    area = reference_system(name).area_of_use
+    if area is None or area.west > area.east:
+        return None
+    box = area.west, max(area.south, -89.999), area.east, min(area.north, 89.999)
+    try:
+        bounds = best_effort(name).transform_bounds(*box, direction=TransformDirection.INVERSE)
+    except ProjError:
+        return None
+    west, south, east, north = bounds
+    return bounds if np.isfinite(bounds).all() and west < east and south < north else None
 
 
 AnyCrs = FeatureCrs | OtherCrs

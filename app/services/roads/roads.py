@@ -276,6 +276,8 @@ class Roads:
                 "realization": placed.realization,
                 "epoch": placed.epoch,
                 "transform_accuracy_m": placed.transform_accuracy_m,
+                "declared_realization": axis.realization,
+                "declared_epoch": axis.epoch,
                 "several": geometry.type == "MultiLineString",
             },
             "calibration": [asdict(point) for point in points],
@@ -297,7 +299,12 @@ class Roads:
             return self._columns(change, change.geometry, change.calibration or ())
         if change.calibration is None:
             return {}, route_of(row)
-        axis = AxisIn(crs=row.given["crs"], epoch=row.given["epoch"])
+        frame = row.given
+        axis = AxisIn(
+            crs=frame["crs"],
+            realization=frame.get("declared_realization"),
+            epoch=frame.get("declared_epoch", frame["epoch"]),
+        )
         points = resolve_calibration(route_of(row).axis, axis, change.calibration, self._accuracy_m)
         route = build_route(row.parts, points)
         return {"calibration": [asdict(point) for point in points], **_extent(route)}, route

@@ -272,6 +272,29 @@ def test_any_system_of_the_registry_is_served(client: httpx.Client) -> None:
     assert client.get(ITEMS, params=outside).json()["features"] == []
 
 
+@pytest.mark.parametrize(
+    ("code", "box"),
+    [
+        (25832, "-5000000,-10000000,10000000,10000000"),
+        (32632, "0,0,1000000,10000000"),
+        (3035, "0,0,9000000,9000000"),
+        (5041, "0,0,4500000,4500000"),
+        (3413, "-5000000,-5000000,5000000,5000000"),
+    ],
+)
+def test_boxes_over_much_of_the_earth(client: httpx.Client, code: int, box: str) -> None:
+    for lat_deg in (49.0, 70.0):
+        position = {"lon_deg": 8.4, "lat_deg": lat_deg}
+        made = client.post("/v1/markers", json={"family": "cerpm", "position": position, "road": "box"})
+        assert made.status_code == 201, made.text
+    sent = {"bbox": box, "bbox-crs": f"http://www.opengis.net/def/crs/EPSG/0/{code}", "road": "box"}
+    answer = client.get(ITEMS, params=sent)
+    assert answer.status_code == 200, answer.text
+    found = {round(feature["geometry"]["coordinates"][1]) for feature in answer.json()["features"]}
+    assert 70 in found
+    assert (49 in found) == (code != 5041)
+
+
 BAD = [
     "nonsense=1",
     "limit=ten",

@@ -192,6 +192,20 @@ def test_known_measures_are_sent_back_as_they_were_answered(client: httpx.Client
     assert again["sections"] == road["sections"]
 
 
+def test_a_new_calibration_is_in_the_realization_of_the_road(client: httpx.Client) -> None:
+    """Positions of posts on a road in NAD83(CORS96) were half a metre off when they were sent again."""
+    geometry = {"type": "LineString", "coordinates": [[500_000, 4_500_000], [500_600, 4_500_100], [500_900, 4_500_800]]}
+    known = [
+        {"measure_m": 0, "position": [500_100.0, 4_500_016.7]},
+        {"measure_m": 900, "position": [500_750.0, 4_500_450.0]},
+    ]
+    body = {"name": "I 80", "crs": "EPSG:26918", "realization": "NAD83(CORS96)", "epoch": 2002.0, "geometry": geometry}
+    road = client.post("/v1/roads", json={**body, "calibration": known}).json()
+    again = _patch(client, road, calibration=known).json()
+    for one, other in zip(road["calibration"], again["calibration"], strict=True):
+        assert other["chainage_m"] == pytest.approx(one["chainage_m"], abs=1e-6)
+
+
 # --- markers ------------------------------------------------------------------------------------------------------
 
 

@@ -88,8 +88,9 @@ def test_stations_are_the_measures_of_the_road() -> None:
     ]
     built = read(road(calibration=stations))
     (stationing,) = built.stationing.values()
-    shown = [stationing.displayed_m(at) for at in (0.0, 100.0, 600.0, 700.0, 900.0, 1000.0)]
-    assert shown == pytest.approx([1000.0, 1100.0, 1602.0, 1702.0, 5000.0, 5100.0], abs=1e-6)
+    shown = [stationing.displayed_m(at) for at in (0.0, 100.0, 350.0, 600.0, 700.0, 900.0, 1000.0)]
+    assert shown == pytest.approx([1000.0, 1100.0, 1351.0, 1602.0, 1702.0, 5000.0, 5100.0], abs=1e-6)
+    assert [equation.ahead_m - equation.back_m for equation in stationing.equations] == pytest.approx([0, 0, 3098])
 
 
 def test_an_alignment_is_as_accurate_as_its_road() -> None:

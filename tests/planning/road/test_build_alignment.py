@@ -302,6 +302,29 @@ def test_the_shift_of_a_datum_without_a_code_is_used() -> None:
     assert any("its own +towgs84" in warning for warning in alignment.warnings)
 
 
+def test_an_ellipsoid_alone_is_no_datum() -> None:
+    """Bessel's ellipsoid has the datums of many countries: the first one that the registry lists was taken."""
+    lane = LaneGeometry("1", UTM.centre + np.array([3e6, 0, 0]))
+    grid = "+proj=tmerc +lat_0=0 +lon_0=9 +k=1 +x_0=3500000 +y_0=0 +ellps=bessel +units=m +no_defs"
+    alone = _declared(lane, grid)
+    assert alone.grade is LocalizationGrade.UNFIT
+    assert any("no known datum" in warning for warning in alone.warnings)
+    assert _declared(lane, grid, crs="EPSG:31467").crs == "EPSG:31467", "the declaration says which datum it is"
+    with pytest.raises(ReferenceSystemError, match="the declaration has EPSG:31468"):
+        _declared(lane, grid, crs="EPSG:31468")
+
+
+def test_heights_are_in_the_datum_and_unit_of_a_compound_system() -> None:
+    assert UTM.centre is not None
+    lane = LaneGeometry("1", UTM.centre + np.array([0.0, 0.0, 700.0]))
+    wkt = CRS("EPSG:26917+6360").to_wkt()  # heights above NAVD88 in US survey feet
+    built = _declared(lane, wkt)
+    assert built.vertical_datum == "EPSG:5703"
+    assert built.lanes[0].height_m == pytest.approx(700 * 1200 / 3937)
+    with pytest.raises(InvalidParameter, match="the declaration has ellipsoid"):
+        _declared(lane, wkt, vertical_datum="ellipsoid")
+
+
 def test_the_horizontal_part_of_a_compound_code_is_used() -> None:
     assert _declared(UTM, "EPSG:5555").crs == "EPSG:25832"
 
