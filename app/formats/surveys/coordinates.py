@@ -170,6 +170,7 @@ class Coordinates:
     height: Floats | None  # shape (N,), or None
     projected: bool | None  # None where the columns do not show it
     form: NumberForm = PLAIN  # of the file's numbers
+    is_sexagesimal: bool = False  # whether longitudes and latitudes are degrees, minutes and seconds
     check_deg: tuple[Floats, Floats] | None = None  # longitudes and latitudes beside eastings and northings
     crs: str | None = None  # of the geometry
     faults: list[Fault] = field(default_factory=list)
@@ -199,7 +200,7 @@ def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places
     first, second, height = (found for found, _wrong in values)
     assert first is not None
     assert second is not None
-    read = Coordinates(first, second, height, pair == PAIRS[1], form, faults=faults)
+    read = Coordinates(first, second, height, pair == PAIRS[1], form, is_sexagesimal, faults=faults)
     if is_sexagesimal:
         read.detected.append(Detected("degrees", "degrees, minutes, seconds", "the signs in most of the values"))
     if shown:

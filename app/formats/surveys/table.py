@@ -360,6 +360,12 @@ def read_numbers(cells: Any, field: str, *, form: NumberForm = PLAIN, required: 
     return values, faults
 
 
+def are_stations(cells: Iterable[object]) -> bool:
+    """Whether all cells that are filled are kilometres and metres such as 12+345.67."""
+    filled = [text for cell in cells if cell is not None and (text := str(cell).strip()[:_MAX_SHOWN])]
+    return bool(filled) and all(STATION.fullmatch(text) for text in filled)
+
+
 def are_sexagesimal(cells: Iterable[str]) -> bool:
     """Whether most of the cells are degrees, minutes and seconds with their signs."""
     filled = [text for cell in cells if (text := cell.strip()[:_MAX_SHOWN])]
