@@ -154,6 +154,8 @@ _IGNORED = (Change("ignore_heights", True),)
 _FEW = 4  # rows whose heights may be equal by chance
 _MIN_SHARE = 0.5  # [1] of the rows that must lie in an area for their order to be possible
 _SYSTEM_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "datum", "coordinatesystem", "koordinatensystem")
+_OF_REGISTRY = frozenset({"localization_grade", "survey_file_sha256"})
+"""Columns of an export of Waymark, in which `crs` is the system of the original survey, not of the coordinates."""
 _EPSG_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "coordinatesystem", "koordinatensystem")
 _ONE_CODE = re.compile(r"(?:EPSG ?:{0,2} ?)?([0-9]{4,6})", re.IGNORECASE)
 _ONE_ZONE = re.compile(r"(?:UTM)? ?(?:zone)? ?([0-9]{1,2}) ?[A-Z]?", re.IGNORECASE)
@@ -350,6 +352,8 @@ def _check_one_system(
         A column of codes, datums or zones has several values, or another zone than the CRS, or a code that is not
         known.
     """
+    if _OF_REGISTRY.issubset(source.names):
+        return None
     stated: tuple[str, Detected] | None = None
     zones: list[tuple[int, str]] = []
     for column, name in enumerate(source.names):

@@ -77,3 +77,10 @@ def test_a_column_with_one_code_states_the_crs() -> None:
         _read("E,N,epsg", f"{GRID},99999", crs=None)
     with pytest.raises(InvalidParameter, match="in both orders"):
         _read("X,Y,epsg", "480000,640000,2180", "480010,640010,2180", crs=None)
+
+
+def test_the_crs_of_an_export_of_the_registry_is_that_of_the_original_survey() -> None:
+    header = "lon_deg,lat_deg,crs,survey_file_sha256,localization_grade"
+    table = _read(header, "8.4,49.0,EPSG:25832,,lane", "8.5,49.0,EPSG:25833,,lane")
+    assert table.first.tolist() == [8.4, 8.5]
+    assert table.crs == "EPSG:4326"
