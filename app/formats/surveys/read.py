@@ -291,6 +291,7 @@ _DOCUMENTS = (
     (b"LASF", "a point cloud", "export the points of the markers alone"),
 )
 """First bytes of files that are sent by mistake, their kind, and how a survey is made of it."""
+_WEST_OR_SOUTH = re.compile(r"[\[({<]\s*(?:°|deg|degrees)?\s*(?:w|west|s|south|o|ouest)\s*[\])}>]\s*$", re.IGNORECASE)
 _MEMBERS = {"easting": "unit", "northing": "unit", "height": "height_unit"}
 """What declares the unit of a column."""
 
@@ -520,6 +521,11 @@ def _unit_names(
         if (column := places[role]) is None:
             continue
         name = source.names[column].strip()[:60]
+        values = read.first if role == "lon_deg" else read.second
+        if role in PAIRS[0] and _WEST_OR_SOUTH.search(name) and (values > 0).any():
+            message = f"the column {name} is named as west or south, and its values are positive"
+            cure = "write decimal degrees, negative in the south and west, and leave the letter out of the name"
+            yield Fault(None, role, "hemisphere_letter", message, cure)
         below = unit_of_cell(source.units[column]) if column < len(source.units) else None
         for named in dict.fromkeys((below, split_unit(name).unit if source.has_names else None)):
             if named is None or named == unit_used or (named == FEET and unit_used in FOOT_NAMES):

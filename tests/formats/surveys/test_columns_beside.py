@@ -84,3 +84,12 @@ def test_the_crs_of_an_export_of_the_registry_is_that_of_the_original_survey() -
     table = _read(header, "8.4,49.0,EPSG:25832,,lane", "8.5,49.0,EPSG:25833,,lane")
     assert table.first.tolist() == [8.4, 8.5]
     assert table.crs == "EPSG:4326"
+
+
+@pytest.mark.parametrize("header", ["lat,Longitude (W)", "Latitude (°S),lon", "Latitude [deg S],lon"])
+def test_a_hemisphere_in_the_name(header: str) -> None:
+    """Before, longitudes west were stored as east."""
+    table = _read(header, "33.5,70.6")
+    assert table.faults.counts == {"hemisphere_letter": 1}
+    assert table.faults.refuses_file
+    assert not _read(header, "-33.5,-70.6").faults.counts
