@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from pyproj import CRS
 
-from app.errors import InvalidParameter
+from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.surveys.declaration import METRES, NUMBER_ROLES, ImportDeclaration
 from app.formats.surveys.roles import WKT_NAMES, cell_text, plain_name
 from app.formats.surveys.table import (
@@ -32,7 +32,7 @@ from app.formats.surveys.table import (
     warn,
 )
 from app.geodesy import normalize_crs, reference_system
-from app.geodesy.systems import best_effort, covers
+from app.geodesy.systems import best_effort, covers, have_same_places, split_heights
 from app.values import Floats, JsonObject
 
 # === Grids of projected systems: their unit, and eastings that begin with the number of the zone.
@@ -154,6 +154,11 @@ _IGNORED = (Change("ignore_heights", True),)
 _FEW = 4  # rows whose heights may be equal by chance
 _MIN_SHARE = 0.5  # [1] of the rows that must lie in an area for their order to be possible
 _SYSTEM_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "datum", "coordinatesystem", "koordinatensystem")
+_OF_REGISTRY = frozenset({"localization_grade", "survey_file_sha256"})
+"""Columns of an export of Waymark, in which `crs` is the system of the original survey, not of the coordinates."""
+_EPSG_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "coordinatesystem", "koordinatensystem")
+_ONE_CODE = re.compile(r"(?:EPSG ?:{0,2} ?)?([0-9]{4,6})", re.IGNORECASE)
+_ONE_ZONE = re.compile(r"(?:UTM)? ?(?:zone)? ?([0-9]{1,2}) ?[A-Z]?", re.IGNORECASE)
 _ZONE_NAMES = ("zone", "utmzone", "gridzone")
 _SYSTEM_VALUE = re.compile(r"[A-Z]|[0-9]{4,6}$", re.IGNORECASE)  # dates, which Datum is in German, are no systems
 _ZONE_VALUE = re.compile(r"[0-9]{1,2} ?[A-Z]?$", re.IGNORECASE)
@@ -170,10 +175,12 @@ class Coordinates:
     height: Floats | None  # shape (N,), or None
     projected: bool | None  # None where the columns do not show it
     form: NumberForm = PLAIN  # of the file's numbers
+    is_sexagesimal: bool = False  # whether longitudes and latitudes are degrees, minutes and seconds
     check_deg: tuple[Floats, Floats] | None = None  # longitudes and latitudes beside eastings and northings
     crs: str | None = None  # of the geometry
     faults: list[Fault] = field(default_factory=list)
     detected: list[Detected] = field(default_factory=list)
+    places: dict[str, int | None] = field(default_factory=dict)  # columns by role
 
 
 def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places: dict[str, int | None]) -> Coordinates:
@@ -199,16 +206,22 @@ def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places
     first, second, height = (found for found, _wrong in values)
     assert first is not None
     assert second is not None
-    read = Coordinates(first, second, height, pair == PAIRS[1], form, faults=faults)
+    read = Coordinates(first, second, height, pair == PAIRS[1], form, is_sexagesimal, faults=faults, places=places)
     if is_sexagesimal:
         read.detected.append(Detected("degrees", "degrees, minutes, seconds", "the signs in most of the values"))
     if shown:
         group = _BLANKS.get(form.group, form.group)
         value = form.decimal + (f", with {group} between groups of three digits" if form.group else "")
         read.detected.append(Detected("decimal sign", value, f"most numbers are written like {shown!r}"))
+    used = set(places.values())
+    if (stated := _check_one_system(source, used, declaration)) is not None:
+        read.crs, found = stated
+        read.detected.append(found)
+        declaration = declaration.model_copy(update={"crs": declaration.crs or read.crs})
     if pair == PAIRS[1]:
         _check_order(source, declaration, places, first, second)
-    _check_one_system(source, set(places.values()))
+    else:
+        read.first, read.second = (_with_hemisphere(source, used, role, read) for role in PAIRS[0])
     if pair == PAIRS[1] and None not in (places["lon_deg"], places["lat_deg"]):
         lon, lat = (_numbers(source, places, role, form, is_sexagesimal)[0] for role in PAIRS[0])
         assert lon is not None
@@ -328,28 +341,153 @@ def _check_order(
         )
 
 
-def _check_one_system(source: SourceTable, used: set[int | None]) -> None:
-    """Refuse rows in several systems; a column that has a role is no column of systems.
+def _check_one_system(
+    source: SourceTable, used: set[int | None], declaration: ImportDeclaration
+) -> tuple[str, Detected] | None:
+    """The CRS that a column of EPSG codes states for all rows; a column that has a role is no column of systems.
 
     Raises
     ------
     InvalidParameter
-        A column of codes, datums or zones has several values.
+        A column of codes, datums or zones has several values, or another zone than the CRS, or a code that is not
+        known.
     """
+    if _OF_REGISTRY.issubset(source.names):
+        return None
+    stated: tuple[str, Detected] | None = None
+    zones: list[tuple[int, str]] = []
     for column, name in enumerate(source.names):
         plain = plain_name(name)
         if column in used or plain not in (*_SYSTEM_NAMES, *_ZONE_NAMES):
             continue
         values = sorted({text for value in source.columns[column] if (text := cell_text(value))})
         form = _ZONE_VALUE if plain in _ZONE_NAMES else _SYSTEM_VALUE
+        shown_name = name.strip()[:40]
+        cure = f'if it is no CRS of the coordinates, declare columns {{"description": "{shown_name}"}}'
         if len(values) > 1 and all(map(form.match, values)):
             shown = ", ".join(text[:30] for text in values[:_FEW])
             raise InvalidParameter(
-                f"the rows are in several systems: the column {name.strip()[:40]!r} has {shown}",
+                f"the rows are in several systems: the column {shown_name!r} has {shown}",
                 field="crs",
                 limit="one CRS a file",
-                cure=f'send a file for each; if it is no CRS, declare columns {{"description": "{name.strip()[:40]}"}}',
+                cure=f"send a file for each; {cure}",
             )
+        if len(values) != 1:
+            continue
+        if plain in _ZONE_NAMES and (found := _ONE_ZONE.fullmatch(values[0])):
+            zones.append((int(found[1]), shown_name))
+        elif plain in _EPSG_NAMES and (found := _ONE_CODE.fullmatch(values[0])):
+            crs, evidence = f"EPSG:{found[1]}", f"all rows of the column {shown_name!r} have the same CRS"
+            if stated is not None and stated[0] != crs:
+                message = f"the columns state several systems: {stated[0]} and {crs}"
+                raise InvalidParameter(message, field="crs", limit="one CRS a file", cure=cure)
+            try:
+                reference_system(split_heights(crs)[0])
+            except ReferenceSystemError as error:
+                message = f"the column {shown_name!r} has {crs}, which is no CRS that is known here"
+                raise InvalidParameter(message, field="crs", limit="the EPSG code of a CRS", cure=cure) from error
+            stated = crs, Detected("crs", crs, evidence)
+    crs_of_all = declaration.crs or (stated[0] if stated is not None else None)
+    own = zone_numbers(reference_system(split_heights(crs_of_all)[0])) if zones and crs_of_all is not None else ()
+    for zone, shown_name in zones:
+        if own and zone not in own:
+            raise InvalidParameter(
+                f"the column {shown_name!r} has zone {zone} in all rows, {crs_of_all} has zone {own[0]}",
+                field="crs",
+                limit=f"zone {own[0]}",
+                cure="declare the CRS of the zone that the rows are in; if it is no zone of the coordinates, declare"
+                f' columns {{"description": "{shown_name}"}}',
+            )
+    if stated is not None and declaration.crs is not None:
+        of_rows, declared = split_heights(stated[0])[0], normalize_crs(declaration.crs)
+        if of_rows != declared and not have_same_places(of_rows, declared):
+            raise InvalidParameter(
+                f"{stated[1].evidence}: {stated[0]}, the declaration has {declared}",
+                field="crs",
+                limit=stated[0],
+                cure="declare the CRS that the coordinates are in; if the column states no CRS of the coordinates,"
+                ' declare columns {"description": its name}',
+            )
+        return None
+    return stated
+
+
+# --- hemispheres ----------------------------------------------------------------------------------------------------
+
+
+_LETTERS = {
+    "n": "N", "north": "N", "northern": "N", "norte": "N", "nord": "N", "s": "S", "south": "S", "southern": "S",
+    "sur": "S", "sud": "S", "e": "E", "east": "E", "eastern": "E", "este": "E", "ost": "E", "est": "E", "w": "W",
+    "west": "W", "western": "W", "oeste": "W", "ouest": "W", "o": "O",
+}  # fmt: skip
+_HEMISPHERES = {"lon_deg": ("E", "W"), "lat_deg": ("N", "S")}
+_OF_HEMISPHERE = r"(?:hemisphere|hemi|hem|h|ref|reference|dir|direction|sign|indicator|ind|cardinal|letter|card|{pair})"
+_LAT = rf"(?:gps)?(?:lat|latitude|latitud|breite){_OF_HEMISPHERE.format(pair='(?:ns|sn|nors)')}"
+_LON = rf"(?:gps)?(?:lon|long|lng|longitude|longitud|lange|laenge){_OF_HEMISPHERE.format(pair='(?:ew|we|eorw)')}"
+_BESIDE = r"(?:hemisphere|hemi)\w*|\w*hemisphere"
+_HEMISPHERE_NAMES = {
+    "lat_deg": re.compile(rf"{_LAT}|(?:ns|sn|nors|northsouth)(?:indicator|ind|hemisphere|hemi)?|{_BESIDE}"),
+    "lon_deg": re.compile(rf"{_LON}|(?:ew|we|eorw|eastwest)(?:indicator|ind|hemisphere|hemi)?|{_BESIDE}"),
+}
+_NAMELESS = ("", "dir", "ref", "direction")
+"""Names of columns that hold hemispheres only between and behind the coordinates; elsewhere they are of traffic."""
+_BOTH_NAMES = re.compile(_BESIDE)
+_MIXED = re.compile(r"[NS][EWO]|O|[+-]1?", re.IGNORECASE)  # other ways to write a hemisphere
+
+
+def _with_hemisphere(source: SourceTable, used: set[int | None], role: str, read: Coordinates) -> Floats:
+    """Longitudes or latitudes with the sign of a column of hemispheres beside them.
+
+    Raises
+    ------
+    InvalidParameter
+        The column has other cells, too, or contradicts signs of the values.
+    """
+    values = read.first if role == "lon_deg" else read.second
+    for column, name in enumerate(source.names):
+        if column in used or not _may_be_hemisphere(source, column, role, read):
+            continue
+        cells = [_LETTERS.get(cell_text(cell).lower().rstrip("."), cell_text(cell)) for cell in source.columns[column]]
+        positive, negative = _HEMISPHERES[role]
+        known = np.isfinite(values)
+        of_rows = {cell for cell, is_known in zip(cells, known.tolist(), strict=True) if is_known}
+        both = {letter for letters in _HEMISPHERES.values() for letter in letters}
+        shown = name.strip()[:40]
+        if of_rows.isdisjoint({positive, negative}):
+            is_of_other = not of_rows.isdisjoint(both) and _BOTH_NAMES.fullmatch(plain_name(name)) is not None
+            is_other_text = not any(_MIXED.fullmatch(cell) for cell in of_rows)
+            if is_of_other or (of_rows.isdisjoint(both) and is_other_text):
+                continue
+        is_negative = np.array([cell == negative for cell in cells], dtype=bool)
+        if not of_rows <= {positive, negative}:
+            other = next(iter(sorted(of_rows - {positive, negative})))
+            problem = f"the column {shown!r} beside {role} has {other[:20]!r}, not only {positive} and {negative}"
+        elif not (values[known] < 0).any():
+            if is_negative[known].any():
+                value = f"{role} is negative where {shown!r} is {negative}"
+                read.detected.append(Detected("hemisphere", value, "all values are without sign"))
+            return np.where(is_negative, -values, values)
+        elif np.array_equal(values[known] < 0, is_negative[known] & (values[known] != 0)):
+            return values
+        else:
+            problem = f"the column {shown!r} contradicts signs of {role}"
+        raise InvalidParameter(
+            problem,
+            field=f"columns.{role}",
+            limit=f"{positive} and {negative} beside values without sign",
+            cure="write decimal degrees, negative in the south and west, and leave the column out; if it holds no"
+            f' hemispheres, declare columns {{"description": "{shown}"}}',
+        )
+    return values
+
+
+def _may_be_hemisphere(source: SourceTable, column: int, role: str, read: Coordinates) -> bool:
+    name = plain_name(source.names[column])
+    if _HEMISPHERE_NAMES[role].fullmatch(name):
+        return True
+    lon, lat = (read.places[one] for one in PAIRS[0])
+    is_between = lon is not None and lat is not None and abs(lon - lat) == 2
+    return is_between and name.rstrip("0123456789") in _NAMELESS and column - 1 == read.places[role]
 
 
 # --- geometry -------------------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from app.formats.surveys.table import (
     detect_number_form,
     read_numbers,
 )
+from app.formats.surveys.units import is_unit
 from app.formats.text import SPACES, as_utf8, detect_delimiter, repeated_names, split_rows
 from app.geodesy import reference_system
 from app.geodesy.systems import HeightSystem
@@ -34,10 +35,6 @@ from app.geodesy.systems import HeightSystem
 
 _NUMERIC = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*")
 _MAX_NUMBER = 40  # [character] longest cell that is a number; a float64 needs 24
-_UNIT = re.compile(
-    r"\s*[\[(]?(?:m|metres?|meters?|ft|us-?ft|usft|sft|ftus|ift|feet|foot|mm|cm|km|deg|degrees|°)[\])]?\s*",
-    re.IGNORECASE,
-)
 _MIN_SHARE = 0.9  # [1] of the first rows that must be numbers, or lie in the area of use
 _MIN_ROWS = 2  # columns cannot be identified by the position of one row alone
 _COORDINATES = ("lon_deg", "lat_deg", "easting", "northing")
@@ -123,7 +120,8 @@ def _named(rows: Sequence[Sequence[str]], names: Sequence[str], index: int) -> H
             )
         )
         header.names = header.names[:width]
-    if header.start < len(rows) and sum(1 for cell in rows[header.start] if _UNIT.fullmatch(cell)) >= 2:
+    below = rows[header.start] if header.start < len(rows) else ()
+    if sum(map(is_unit, below)) >= 2 and not any(map(_is_number, below)):
         header.start += 1
         header.units = tuple(cell.strip() for cell in rows[header.start - 1])
         cells = " ".join(filter(None, header.units))

@@ -31,7 +31,7 @@ METRES: dict[str, float] = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.304
 """Metres to a unit of length: US survey foot and international foot (NIST SP 811)."""
 FEET = "ft"
 """Unit of a file that does not state which foot."""
-_FOOT_NAMES = ("ft-us", "ft-intl")
+FOOT_NAMES = ("ft-us", "ft-intl")
 TEXT_ROLES = ("point", "code", "description", "road", "side", "status")
 NUMBER_ROLES = ("heading_deg", "measure_m", "offset_m", "horizontal_rmse_m", "vertical_rmse_m")
 COORDINATE_ROLES = ("lon_deg", "lat_deg", "easting", "northing", "height")
@@ -57,9 +57,9 @@ def choose_foot(declared: str | None, crs_unit_m: float) -> tuple[str, bool]:
     of_crs : bool
         Whether it is that of the CRS.
     """
-    if declared in _FOOT_NAMES:
+    if declared in FOOT_NAMES:
         return declared, False
-    own = next((foot for foot in _FOOT_NAMES if abs(crs_unit_m / METRES[foot] - 1) < 1e-9), None)
+    own = next((foot for foot in FOOT_NAMES if abs(crs_unit_m / METRES[foot] - 1) < 1e-9), None)
     return own or "ft-intl", own is not None
 
 

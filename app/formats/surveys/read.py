@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from codecs import BOM_UTF8
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import chain, islice
 from typing import Any
@@ -24,10 +24,19 @@ from app.formats.format import (
     detect_signature,
     list_accepted,
 )
-from app.formats.surveys.coordinates import check_second_pair, crs_unit, read_coordinates, unit_factor, without_zone
+from app.formats.surveys.coordinates import (
+    PAIRS,
+    Coordinates,
+    check_second_pair,
+    crs_unit,
+    read_coordinates,
+    unit_factor,
+    without_zone,
+)
 from app.formats.surveys.csv_reader import read_csv, read_gsi
 from app.formats.surveys.declaration import (
     FEET,
+    FOOT_NAMES,
     METRES,
     NUMBER_ROLES,
     TEXT_ROLES,
@@ -48,9 +57,11 @@ from app.formats.surveys.table import (
     SourceTable,
     SurveyTable,
     Texts,
+    are_stations,
     read_numbers,
     warn,
 )
+from app.formats.surveys.units import split_unit, unit_of_cell
 from app.formats.text import guess_encoding
 from app.geodesy import normalize_crs, reference_system
 from app.geodesy.systems import HeightSystem, have_same_places, split_heights, system_of_wkt
@@ -280,12 +291,9 @@ _DOCUMENTS = (
     (b"LASF", "a point cloud", "export the points of the markers alone"),
 )
 """First bytes of files that are sent by mistake, their kind, and how a survey is made of it."""
-_UNIT_ENDING = re.compile(
-    r"(?:^|_|\s*[\[(]\s*)(?:(?P<us>us[-_ ]?s?(?:urvey[-_ ]?)?(?:ft|feet|foot)|sft|ft[-_ ]?us)"
-    r"|(?P<intl>ift|ft[-_ ]?intl)|(?P<ft>ft|feet|foot)|(?P<m>m|met(?:re|er)s?)|(?P<other>mm|cm|km))\s*[\])]?$"
-)
-_MAX_NAME = 100  # [character] of a name that are looked at
-_UNITS_NAMED = {"us": "ft-us", "intl": "ft-intl", "ft": "ft-intl or ft-us", "m": "m"}
+_WEST_OR_SOUTH = re.compile(r"[\[({<]\s*(?:°|deg|degrees)?\s*(?:w|west|s|south|o|ouest)\s*[\])}>]\s*$", re.IGNORECASE)
+_MEMBERS = {"easting": "unit", "northing": "unit", "height": "height_unit"}
+"""What declares the unit of a column."""
 
 
 def read_survey(data: bytes, declaration: ImportDeclaration, code_form: CodeForm | None = None) -> SurveyTable:
@@ -350,7 +358,7 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
             cure="declare the CRS of the control points",
         )
     first, zone = without_zone(read.first, system) if unit == "m" and not is_local else (read.first, None)
-    faults += [*read.faults, *feet, *_unit_names(source, places, unit, height_unit, has_height=has_height)]
+    faults += [*read.faults, *feet, *_unit_names(source, places, unit, height_unit, read)]
     if not is_local:
         faults += check_second_pair(replace(read, first=first), crs, unit_factor(unit, system))
     if zone is not None:
@@ -502,24 +510,52 @@ def _datum(
 
 
 def _unit_names(
-    source: SourceTable, places: dict[str, int | None], unit: str, height_unit: str, *, has_height: bool
-) -> list[Fault]:
-    """Columns whose names end with another unit than the one that is used."""
-    faults = []
-    for role, unit_used in (("easting", unit), ("northing", unit), ("height", height_unit)):
-        column = places[role] if unit_used != "deg" and (has_height or role != "height") else None
-        name = source.names[column].strip() if column is not None else ""
-        below = source.units[column] if column is not None and column < len(source.units) else ""
-        found = _UNIT_ENDING.search(below.lower()) or (_UNIT_ENDING.search(name.lower()[:_MAX_NAME]) if name else None)
-        named = _UNITS_NAMED.get(found.lastgroup or "", found[found.lastgroup or 0]) if found else None
-        if named is not None and unit_used not in named.split(" or "):
-            message = f"the column {name} is named in {named}, its values are read as {unit_used}"
-            member = "height_unit" if role == "height" else "unit"
-            changes = (Change(member, named),) if named in METRES else ()
-            is_known = not set(named.split(" or ")).isdisjoint(METRES)
-            cure = f"declare {member} {named}" if is_known else f"write the column in {', '.join(METRES)}"
-            faults.append(Fault(None, role, "unit_in_header", message, cure, Severity.REFUSED, changes))
-    return faults
+    source: SourceTable, places: dict[str, int | None], unit: str, height_unit: str, read: Coordinates
+) -> Iterator[Fault]:
+    """Columns whose names, or the row of units below them, have another unit than the one that is used."""
+    used = dict.fromkeys(NUMBER_ROLES, "m") | {"heading_deg": "deg"}
+    if source.points is None:
+        used |= {"lon_deg": "deg", "lat_deg": "deg"} if unit == "deg" else {"easting": unit, "northing": unit}
+        used |= {"height": height_unit} if read.height is not None else {}
+    for role, unit_used in used.items():
+        if (column := places[role]) is None:
+            continue
+        name = source.names[column].strip()[:60]
+        values = read.first if role == "lon_deg" else read.second
+        if role in PAIRS[0] and _WEST_OR_SOUTH.search(name) and (values > 0).any():
+            message = f"the column {name} is named as west or south, and its values are positive"
+            cure = "write decimal degrees, negative in the south and west, and leave the letter out of the name"
+            yield Fault(None, role, "hemisphere_letter", message, cure)
+        below = unit_of_cell(source.units[column]) if column < len(source.units) else None
+        for named in dict.fromkeys((below, split_unit(name).unit if source.has_names else None)):
+            if named is None or named == unit_used or (named == FEET and unit_used in FOOT_NAMES):
+                continue
+            if named == "degrees, minutes" and read.is_sexagesimal and role in PAIRS[0]:
+                continue
+            if role == "measure_m" and named == "km" and are_stations(source.columns[column]):
+                continue
+            yield _fault_of_unit(role, name, named, unit_used)
+            break
+
+
+def _fault_of_unit(role: str, name: str, named: str, unit_used: str) -> Fault:
+    message = f"the column {name} is named in {named}, its values are read as {unit_used}"
+    member = _MEMBERS.get(role)
+    changes: tuple[Change, ...] = ()
+    if member is not None and named in METRES:
+        cure, changes = f"declare {member} {named}", (Change(member, named),)
+    elif member is not None:
+        one_of = " or ".join(FOOT_NAMES)
+        cure = f"declare {member} {one_of}" if named == FEET else f"write the column in {', '.join(METRES)}"
+    elif role in PAIRS[0]:
+        cure = "write decimal degrees, or degrees, minutes and seconds with their signs, and name the column so"
+    else:
+        quantity = "degrees" if unit_used == "deg" else "metres"
+        cure, changes = (
+            f'write the column in {quantity}, or declare columns {{"{role}": null}}',
+            (Change(f"columns.{role}", None),),
+        )
+    return Fault(None, role, "unit_in_header", message, cure, Severity.REFUSED, changes)
 
 
 def _texts(source: SourceTable, column: int | None) -> Texts:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 from app.errors import InvalidParameter
 from app.formats.surveys.declaration import NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
 from app.formats.surveys.table import STATION, Change, Detected, Fault, SourceTable, warn
-from app.formats.text import normal_name
+from app.formats.surveys.units import LENGTHS, split_unit
 from app.markers.reading import STATUSES
 
 _NAMES = {
@@ -41,13 +40,9 @@ _NAMES = {
 """Names of columns as survey software writes them, in English, German and Spanish; the first that is there is taken."""
 _ELLIPSOIDAL = ("ellipsoidalheight", "ellipsoidheight", "ellheight", "ellipsheight", "hell", "ellh")
 WKT_NAMES = ("wkt", "wktgeom", "geom", "geometry", "thegeom", "geomwkt")
-_UNIT = re.compile(r"_(?:m|metres?|meters?|u?s?_?s?ft|ft_?us|ft_?intl|i?ft|feet|deg|degrees|dd|gon)$")
-_IN_BRACKETS = re.compile(r"\s*[\[(][^\])]*[\])]\s*$")  # a unit or a datum behind the name
-_MAX_NAME = 100  # [character] of a name that are looked at
 _SAMPLE = 2000  # values by which a column is recognised
 _MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows
 _MAX_SHOWN = 20  # names in a report
-_IN_METRES = re.compile(r"(?:_m|[\[(]\s*m\s*[\])])\s*$", re.IGNORECASE)  # at the end of a name
 _NUMBER = r"[+-]?[0-9.,]+(?:[eE][+-]?[0-9]+)?"
 _SIDES = ("left", "right", "unknown")
 
@@ -70,9 +65,7 @@ class Roles(NamedTuple):
 
 def plain_name(name: str) -> str:
     """A column's name without accents, case, blanks and unit: ``Punkt-Nr.`` is ``punktnr``, ``Höhe [m]`` ``hohe``."""
-    name = name.strip()[:_MAX_NAME]
-    letters = unicodedata.normalize("NFKD", _IN_BRACKETS.sub("", name) or name)
-    return _UNIT.sub("", normal_name("".join(c for c in letters if not unicodedata.combining(c)))).replace("_", "")
+    return split_unit(name).stem
 
 
 def names_coordinates(names: Sequence[str]) -> bool:
@@ -183,13 +176,15 @@ def _evidence(cells: Sequence[object], role: str, name: str, code_form: CodeForm
     elif role in ("status", "side"):
         known = STATUSES if role == "status" else _SIDES
         fits, form = lambda text: text.lower() in known, f"one of {', '.join(known)}"
-    elif role == "measure_m" and _IN_METRES.search(name):
+    elif role == "measure_m" and _names_length(name):
         fits, form = re.compile(rf"{_NUMBER}|{STATION.pattern}").fullmatch, "a number"
     elif role == "measure_m":  # numbers may be metres, kilometres or names of points
         if not any(STATION.fullmatch(text) for text in _sample(cells)):
             return "", False
         fits, form = STATION.fullmatch, "kilometres and metres such as 12+345.67"
     elif role == "point":
+        if _names_length(name):
+            return "", False
         values = list(_sample(cells))
         return "", sum(1 for text in values if STATION.fullmatch(text)) <= _MIN_SHARE * len(values)
     elif role in NUMBER_ROLES:
@@ -204,6 +199,12 @@ def _evidence(cells: Sequence[object], role: str, name: str, code_form: CodeForm
     if role == "code" and code_form is not None and code_form.differ and len(set(values)) < _MIN_SHARE * len(values):
         return f"{len(values)} values are only {len(set(values))} different ones, and each marker has its own", False
     return f"{good} of {len(values)} values are {form}", True
+
+
+def _names_length(name: str) -> bool:
+    """Whether a name is followed by a unit of length, which measures have and names of points have not."""
+    stem, unit = split_unit(name)
+    return stem != unit and unit in LENGTHS
 
 
 def _sample(cells: Sequence[object]) -> Iterator[str]:

@@ -360,6 +360,12 @@ def read_numbers(cells: Any, field: str, *, form: NumberForm = PLAIN, required: 
     return values, faults
 
 
+def are_stations(cells: Iterable[object]) -> bool:
+    """Whether all cells that are filled are kilometres and metres such as 12+345.67."""
+    filled = [text for cell in cells if cell is not None and (text := str(cell).strip()[:_MAX_SHOWN])]
+    return bool(filled) and all(STATION.fullmatch(text) for text in filled)
+
+
 def are_sexagesimal(cells: Iterable[str]) -> bool:
     """Whether most of the cells are degrees, minutes and seconds with their signs."""
     filled = [text for cell in cells if (text := cell.strip()[:_MAX_SHOWN])]
@@ -420,6 +426,10 @@ def _read_one(cell: object, field: str, row: int, form: NumberForm, required: bo
         plain = text.replace(form.group, "") if found["rest"] is None or found["rest"][0] == form.decimal else text
     if form.decimal == "," and "." not in plain:
         plain = plain.replace(",", ".")
+    elif form.decimal == "," and isinstance(cell, str) and _PLAIN.fullmatch(plain):
+        message = f"{field} is {text.strip()[:40]!r}: a point, in a file with decimal commas"
+        cure = "write all numbers in the same form; declare decimal if the point is the decimal sign of the file"
+        return Fault(row, field, "decimal_point", message, cure)
     if _PLAIN.fullmatch(plain):
         value = float(plain)
         if np.isfinite(value):

@@ -86,3 +86,14 @@ def test_a_cell_in_another_form_than_the_majority_is_a_fault() -> None:
     form, _shown = detect_number_form(cells, None)
     _values, faults = read_numbers(cells, "easting", form=form, required=True)
     assert [(fault.row, fault.code) for fault in faults] == [(2, "grouped_digits"), (4, "decimal_comma")]
+
+
+@pytest.mark.parametrize("cell", ["1.234", "300.5", "-1.234"])
+def test_a_point_in_a_file_with_decimal_commas_is_ambiguous(cell: str) -> None:
+    """It separates decimals or thousands; before, the height 1.234 of such a file was 1.234 m."""
+    values, faults = read_numbers(["457000,12", cell], "height", form=NumberForm(","), required=True)
+    assert values[0] == 457000.12
+    assert np.isnan(values[1])
+    assert [(fault.row, fault.code) for fault in faults] == [(2, "decimal_point")]
+    assert read_numbers(["5.428.000,34", "1.234"], "height", form=NumberForm(",", "."), required=True)[0][1] == 1234
+    assert read_numbers([1.234], "height", form=NumberForm(","), required=True)[0][0] == 1.234

@@ -153,7 +153,7 @@ def test_columns_x_and_y_of_which_one_order_lies_in_the_area_are_read() -> None:
         ("Datum", ["12.05.2024", "13.05.2024"], False),  # German for a date
         ("Zone", ["32U", "33U"], True),
         ("zone", ["north", "south"], False),
-        ("epsg", ["25832", "25832"], False),
+        ("epsg", ["4326", "4326"], False),
     ],
 )
 def test_rows_in_several_systems_are_refused(name: str, cells: list[str], refused: bool) -> None:
