@@ -12,7 +12,7 @@ from typing import NamedTuple
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.surveys.coordinates import share_inside
 from app.formats.surveys.declaration import FEET, FIXED_LAYOUTS, ImportDeclaration
-from app.formats.surveys.roles import names_coordinates
+from app.formats.surveys.roles import is_unit, names_coordinates
 from app.formats.surveys.table import (
     MAX_COLUMNS,
     MAX_ROWS,
@@ -25,7 +25,6 @@ from app.formats.surveys.table import (
     detect_number_form,
     read_numbers,
 )
-from app.formats.surveys.units import is_unit
 from app.formats.text import SPACES, as_utf8, detect_delimiter, repeated_names, split_rows
 from app.geodesy import reference_system
 from app.geodesy.systems import HeightSystem

@@ -44,7 +44,7 @@ from app.formats.surveys.declaration import (
     choose_datum,
     choose_foot,
 )
-from app.formats.surveys.roles import CodeForm, cell_text, find_roles
+from app.formats.surveys.roles import CodeForm, cell_text, find_roles, split_unit, unit_of_cell
 from app.formats.surveys.table import (
     MAX_COLUMNS,
     MAX_ROWS,
@@ -61,7 +61,6 @@ from app.formats.surveys.table import (
     read_numbers,
     warn,
 )
-from app.formats.surveys.units import split_unit, unit_of_cell
 from app.formats.text import guess_encoding
 from app.geodesy import normalize_crs, reference_system
 from app.geodesy.systems import HeightSystem, have_same_places, split_heights, system_of_wkt

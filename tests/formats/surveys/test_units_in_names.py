@@ -8,8 +8,8 @@ import pytest
 
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
+from app.formats.surveys.roles import split_unit
 from app.formats.surveys.table import SurveyTable
-from app.formats.surveys.units import split_unit
 
 
 def _grid(header: str, *rows: str, **declared: Any) -> SurveyTable:
