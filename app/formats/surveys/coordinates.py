@@ -145,7 +145,10 @@ def share_inside(easting: Floats, northing: Floats, declaration: ImportDeclarati
 PAIRS = (("lon_deg", "lat_deg"), ("easting", "northing"))
 _SAMPLE = 1000  # cells of a column by which the form of its numbers is detected
 _BLANKS = {" ": "blanks", "\u00a0": "no-break spaces", "\u2009": "thin spaces", "\u202f": "narrow no-break spaces"}
-_WKT = re.compile(r"\s*(?:SRID=[0-9]+;)?\s*(?:MULTI)?POINT\b.*|0[01][0-9A-Fa-f]{40,}", re.IGNORECASE | re.DOTALL)
+_WKT = re.compile(  # also with the marks of Z and M, and WKB as PostGIS or its `bytea` write it
+    r"\s*(?:SRID=[0-9]+;)?\s*(?:MULTI)?POINT(?:\s*(?:ZM?|M))?\b.*|(?:\\x)?0[01][0-9A-Fa-f]{40,}",
+    re.IGNORECASE | re.DOTALL,
+)
 _SRID = re.compile(r"SRID=([0-9]{4,6});", re.IGNORECASE)
 _AGREE_M = 5.0
 """Difference between two pairs of coordinates of a row that the datums of a continent explain. [m] Above NAD83 - WGS 84
@@ -365,7 +368,7 @@ def _wkt_column(source: SourceTable) -> int | None:
 
 
 def _from_wkt(source: SourceTable, column: int) -> Coordinates:
-    texts = [cell_text(value) for value in source.columns[column]]
+    texts = [cell_text(value).removeprefix("\\x") for value in source.columns[column]]
     first = next(text for text in texts if text)
     is_hex = first[0] == "0"
     read: Any = shapely.from_wkb if is_hex else shapely.from_wkt
