@@ -242,11 +242,14 @@ _WGS84 = {"Latitude": "lat_deg", "Longitude": "lon_deg", "Height": "ellipsoidal_
 _TEXTS = {"Name": "point", "Code": "code", "SurveyMethod": "method"}
 _POOR = ("Float", "Code", "Autonomous", "SBAS", "Differential")
 """Ends of survey methods without fixed ambiguities: Trimble JobXML schema 5.3, SurveyMethodEnum."""
+_SHOWN = 10  # names of points in a report
 _NAMES = (*_TEXTS.values(), *_GRID.values(), *_WGS84.values())
 
 
 def read_jobxml(data: bytes) -> SourceTable:
     """Points below `Reductions`, which have been averaged and adjusted; lengths are in metres whatever the job shows.
+
+    Points that were deleted in the job are left out.
 
     Raises
     ------
@@ -255,17 +258,24 @@ def read_jobxml(data: bytes) -> SourceTable:
     """
     rows: list[dict[str, str | float | None]] = []
     without, faults = 0, Faults()
+    deleted: list[str] = []
     for point in elements(data, "Point"):
         row = _row(point)
-        if row is None:
+        if _is_deleted(point):
+            deleted.append(next((child.text or "" for child in point if local_name(child.tag) == "Name"), "").strip())
+        elif row is None:
             without += 1
         else:
             rows.append(row)
             faults.add(_check_method(len(rows), str(row["method"] or "")))
         check_size(len(rows), len(_NAMES))
     detected = [Detected("unit", "m", "JobXML has its lengths in metres")]
-    if without:
-        detected.append(Detected("other points", f"{without} left out", "points without coordinates"))
+    if without or deleted:
+        reasons = ["points without coordinates"] if without else []
+        if deleted:
+            shown = ", ".join(name[:40] for name in deleted[:_SHOWN]) + (" and others" if deleted[_SHOWN:] else "")
+            reasons.append(f"{len(deleted)} deleted in the job: {shown}")
+        detected.append(Detected("other points", f"{without + len(deleted)} left out", "; ".join(reasons)))
     names = tuple(name for name in _NAMES if any(row[name] is not None for row in rows))
     columns = tuple([row[name] for row in rows] for name in names)
     return SourceTable("jobxml", names, columns, unit="m", faults=faults, detected=tuple(detected))
@@ -280,6 +290,12 @@ def _check_method(row: int, method: str) -> list[Fault]:
         message = f"the point was measured with {method}: decimetres to metres"
         return [warn(row, "point", "poor_solution", message, "measure it again with fixed ambiguities")]
     return []
+
+
+def _is_deleted(point: ET.Element) -> bool:
+    """Whether the classification, such as ``DeletedNormal``, says so."""
+    texts = (child.text or "" for child in point if local_name(child.tag) == "Classification")
+    return any(text.strip().lower().startswith("deleted") for text in texts)
 
 
 def _row(point: ET.Element) -> dict[str, str | float | None] | None:

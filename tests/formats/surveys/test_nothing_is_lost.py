@@ -47,3 +47,19 @@ def test_bytea() -> None:
         read = _read(f"id,geom\n1,{cell}\n2,{cell}", vertical_datum="ellipsoid")
         assert (read.crs, read.first[1], read.second[1]) == ("EPSG:25832", 457000, 5428000)
         assert (None if read.height is None else read.height[0]) == height
+
+
+# --- JobXML -----------------------------------------------------------------------------------------------------------
+
+
+def test_points_that_were_deleted_in_a_job_are_left_out() -> None:
+    point = (
+        "<Point><Name>{}</Name><Classification>{}</Classification>"
+        "<Grid><North>5428000</North><East>457000</East><Elevation>112.5</Elevation></Grid></Point>"
+    )
+    kinds = (("101", "Normal"), ("102", "DeletedNormal"), ("103", "DeletedControl"))
+    points = "".join(point.format(*kind) for kind in kinds)
+    read = _read(f"<JOBFile><Reductions>{points}</Reductions></JOBFile>", crs="EPSG:25832", vertical_datum="ellipsoid")
+    assert list(read.texts["point"]) == ["101"]
+    others = next(one for one in read.detected if one.what == "other points")
+    assert (others.value, others.evidence) == ("2 left out", "2 deleted in the job: 102, 103")
