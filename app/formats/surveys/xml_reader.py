@@ -26,7 +26,10 @@ _LANDXML_UNITS = {"meter": "m", "foot": FEET, "ussurveyfoot": "ft-us"}
 
 
 def read_kml(data: bytes) -> SourceTable:
-    """Placemarks that are points; their names, descriptions and data are columns. Longitude first, as KML has it.
+    """Points of placemarks, one row for each point of a MultiGeometry; their names, descriptions and data are columns.
+
+    Longitude first, as KML has it. Altitudes are heights where their mode is ``absolute``; the others, also those
+    without a mode, are above the ground, or mean nothing (OGC KML 2.2, altitudeModeEnumType).
 
     Raises
     ------
@@ -36,14 +39,27 @@ def read_kml(data: bytes) -> SourceTable:
     rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
+    above_ground = 0
     for placemark in elements(data, "Placemark"):
-        text = next((e.text or "" for e in _below(placemark, "Point") for e in _below(e, "coordinates")), "")
-        point = _numbers(text.split(","))
-        rows.append(_kml_values(placemark))
-        if point is None or len(point) not in (2, 3):
-            faults.append(Fault(len(rows), "geometry", "no_point", "the placemark is no point with finite numbers"))
-            point = [math.nan, math.nan]
-        points.append((point[0], point[1], point[2] if len(point) == 3 else math.nan))
+        values = _kml_values(placemark)
+        for element in list(_below(placemark, "Point")) or [ET.Element("Point")]:
+            point = _numbers(_text_of(element, "coordinates").split(","))
+            rows.append(values)
+            if point is None or len(point) not in (2, 3):
+                faults.append(Fault(len(rows), "geometry", "no_point", "the placemark is no point with finite numbers"))
+                point = [math.nan, math.nan]
+            height = point[2] if len(point) == 3 else math.nan
+            if math.isfinite(height) and _text_of(element, "altitudeMode").strip() != "absolute":
+                above_ground += height != 0
+                height = math.nan
+            points.append((point[0], point[1], height))
+    if above_ground:
+        message = (
+            f"{above_ground} altitudes are above the ground or without meaning, as altitudeMode states, which is"
+            " clampToGround where it is missing; they were left out"
+        )
+        cure = "if they are heights above the vertical datum, write altitudeMode absolute into each Point"
+        faults.append(warn(None, "height", "altitude_mode", message, cure))
     return _table("kml", rows, points, faults, crs="EPSG:4326")
 
 
@@ -194,6 +210,10 @@ def elements(data: bytes, *names: str) -> Iterator[ET.Element]:
 
 def _below(element: ET.Element, name: str) -> Iterator[ET.Element]:
     return (child for child in element.iter() if local_name(child.tag) == name)
+
+
+def _text_of(element: ET.Element, name: str) -> str:
+    return next((below.text or "" for below in _below(element, name)), "")
 
 
 def _kml_values(placemark: ET.Element) -> dict[str, object]:

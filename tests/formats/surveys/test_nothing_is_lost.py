@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import shapely
 
@@ -63,3 +64,40 @@ def test_points_that_were_deleted_in_a_job_are_left_out() -> None:
     assert list(read.texts["point"]) == ["101"]
     others = next(one for one in read.detected if one.what == "other points")
     assert (others.value, others.evidence) == ("2 left out", "2 deleted in the job: 102, 103")
+
+
+# --- KML --------------------------------------------------------------------------------------------------------------
+
+
+def _placemark(name: str, inside: str, data: str = "") -> str:
+    return f"<Placemark><name>{name}</name>{data}{inside}</Placemark>"
+
+
+def _point(place: str, mode: str | None = None) -> str:
+    altitude = "" if mode is None else f"<altitudeMode>{mode}</altitudeMode>"
+    return f"<Point>{altitude}<coordinates>{place}</coordinates></Point>"
+
+
+def _kml(*placemarks: str) -> str:
+    return f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{"".join(placemarks)}</Document></kml>'
+
+
+def test_only_absolute_altitudes_are_heights() -> None:
+    modes = ("absolute", "relativeToGround", "clampToGround", None)
+    marks = [_placemark(f"{mode}", _point("8.4,49.0,130.5", mode)) for mode in modes]
+    read = _read(_kml(*marks), vertical_datum="ellipsoid")
+    assert read.height is not None
+    assert np.isfinite(read.height).tolist() == [True, False, False, False]
+    (warning,) = read.faults.shown(9)
+    assert (warning.row, warning.code, warning.message[:11]) == (None, "altitude_mode", "3 altitudes")
+    assert _read(_kml(*marks[1:])).height is None
+    assert _read(_kml(marks[0]), vertical_datum="ellipsoid").faults.counts == {}
+
+
+def test_every_point_of_a_multigeometry_is_a_row() -> None:
+    many = f"<MultiGeometry>{_point('8.4,49.0')}<MultiGeometry>{_point('8.5,49.1')}</MultiGeometry></MultiGeometry>"
+    line = "<LineString><coordinates>8.4,49.0 8.5,49.1</coordinates></LineString>"
+    read = _read(_kml(_placemark("a", many), _placemark("b", line), _placemark("c", _point("8.6,49.2"))))
+    assert list(read.texts["point"]) == ["a", "a", "b", "c"]
+    assert read.first[[0, 1, 3]].tolist() == [8.4, 8.5, 8.6]
+    assert [(fault.row, fault.code) for fault in read.faults.shown(9)] == [(3, "no_point")]
