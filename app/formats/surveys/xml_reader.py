@@ -10,11 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.errors import UnreadableUpload
+from app.errors import ReferenceSystemError, UnreadableUpload
 from app.formats.format import ArchiveLimits, read_members
 from app.formats.surveys.declaration import FEET
 from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, Faults, SourceTable, warn
 from app.formats.xml_tree import MAX_BYTES, check_xml, local_name
+from app.geodesy import normalize_crs, reference_system
+from app.geodesy.systems import split_heights
 
 MAX_ELEMENTS = 20 * MAX_ROWS
 """Elements of a document."""
@@ -133,8 +135,10 @@ def read_landxml(data: bytes) -> SourceTable:
     for element in elements(data, "CgPoint", "CoordinateSystem", "Metric", "Imperial"):
         kind = local_name(element.tag)
         if kind == "CoordinateSystem":
-            code = element.get("epsgCode")
-            crs = f"EPSG:{code}" if code else crs
+            code = element.get("epsgCode", "").strip()
+            if code:
+                crs, problem = _landxml_crs(code)
+                faults += problem
         elif kind != "CgPoint":
             unit = _linear_unit(element.get("linearUnit", ""))
             height_unit = _elevation_unit(element.get("elevationUnit", ""), unit)
@@ -146,6 +150,21 @@ def read_landxml(data: bytes) -> SourceTable:
                 found = [math.nan, math.nan]
             points.append((found[1], found[0], found[2] if len(found) == 3 else math.nan))
     return replace(_table("landxml", rows, points, faults, crs=crs, unit=unit), height_unit=height_unit)
+
+
+def _landxml_crs(code: str) -> tuple[str | None, list[Fault]]:
+    """The CRS of an epsgCode; none, and a warning, where it cannot be used."""
+    try:
+        crs = normalize_crs(code if code.upper().startswith("EPSG:") else f"EPSG:{code}")
+        horizontal, _heights = split_heights(crs)
+        if "[" not in horizontal:
+            reference_system(horizontal)
+    except ReferenceSystemError as error:
+        message = f"the epsgCode {code[:20]!r} of the file cannot be used: {error.message}"
+        return None, [
+            warn(None, "crs", "unusable_crs", message, "check the declared crs: the file does not confirm it")
+        ]
+    return crs, []
 
 
 def _linear_unit(name: str) -> str:

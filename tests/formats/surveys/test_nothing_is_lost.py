@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
+from app.errors import InvalidParameter
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.formats.surveys.table import SurveyTable
@@ -101,3 +102,29 @@ def test_every_point_of_a_multigeometry_is_a_row() -> None:
     assert list(read.texts["point"]) == ["a", "a", "b", "c"]
     assert read.first[[0, 1, 3]].tolist() == [8.4, 8.5, 8.6]
     assert [(fault.row, fault.code) for fault in read.faults.shown(9)] == [(3, "no_point")]
+
+
+# --- LandXML ----------------------------------------------------------------------------------------------------------
+
+
+def _landxml(code: str) -> str:
+    return (
+        '<LandXML><Units><Metric linearUnit="meter"/></Units>'
+        f'<CoordinateSystem epsgCode="{code}"/><CgPoints><CgPoint name="1">5428000 457000</CgPoint></CgPoints></LandXML>'
+    )
+
+
+@pytest.mark.parametrize("code", ["25832", " EPSG:25832 ", "epsg:25832", "5555"])
+def test_usable_codes_of_landxml(code: str) -> None:
+    read = _read(_landxml(code))
+    assert (read.crs, len(read.faults)) == ("EPSG:25832", 0)
+    with pytest.raises(InvalidParameter, match="the file is in EPSG:25832"):
+        _read(_landxml(code), crs="EPSG:25833")
+
+
+@pytest.mark.parametrize("code", ["0", "-1", "25832.0", "999999", "7837", "EPSG:EPSG:25832", "x[", "5" * 5000])
+def test_with_an_unusable_code_the_declared_system_counts(code: str) -> None:
+    read = _read(_landxml(code), crs="EPSG:25832")
+    assert (read.crs, read.faults.counts) == ("EPSG:25832", {"unusable_crs": 1})
+    with pytest.raises(InvalidParameter, match="is not declared"):
+        _read(_landxml(code))
