@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import json
+from pathlib import Path
 from typing import Any
 
+import ezdxf
 import numpy as np
 import pytest
 import shapely
+from pyogrio import raw
 
 from app.errors import InvalidParameter
 from app.formats.surveys.declaration import ImportDeclaration
@@ -110,7 +115,8 @@ def test_every_point_of_a_multigeometry_is_a_row() -> None:
 def _landxml(code: str) -> str:
     return (
         '<LandXML><Units><Metric linearUnit="meter"/></Units>'
-        f'<CoordinateSystem epsgCode="{code}"/><CgPoints><CgPoint name="1">5428000 457000</CgPoint></CgPoints></LandXML>'
+        f'<CoordinateSystem epsgCode="{code}"/><CgPoints><CgPoint name="1">5428000 457000</CgPoint></CgPoints>'
+        "</LandXML>"
     )
 
 
@@ -128,3 +134,110 @@ def test_with_an_unusable_code_the_declared_system_counts(code: str) -> None:
     assert (read.crs, read.faults.counts) == ("EPSG:25832", {"unusable_crs": 1})
     with pytest.raises(InvalidParameter, match="is not declared"):
         _read(_landxml(code))
+
+
+# --- heights beside geometry ------------------------------------------------------------------------------------------
+
+PLACES = [(457000.0, 5428000.0), (457010.0, 5428000.0), (457020.0, 5428001.0)]
+HEIGHTS = [130.5, 131.25, 129.75]
+
+
+def _geojson(heights: Any, z: list[float] | None = None) -> str:
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"H": height},
+            "geometry": {"type": "Point", "coordinates": [*place, *([] if z is None else [z[k]])]},
+        }
+        for k, (place, height) in enumerate(zip(PLACES, heights, strict=True))
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features})
+
+
+def _gpkg(folder: Path) -> bytes:
+    path = folder / "a.gpkg"
+    raw.write(
+        path, shapely.to_wkb(shapely.points(PLACES)), [np.array(HEIGHTS)], ["H"], driver="GPKG", layer="a",
+        geometry_type="Point", crs="EPSG:25832",
+    )  # fmt: skip
+    return path.read_bytes()
+
+
+def _dxf(_folder: Path) -> bytes:
+    document = ezdxf.new()
+    document.units = 6
+    document.blocks.new("nail").add_attdef("HOEHE", (0, 0))
+    for place, height in zip(PLACES, HEIGHTS, strict=True):
+        document.modelspace().add_blockref("nail", place).add_attrib("HOEHE", str(height))
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue().encode()
+
+
+def _kml_with_data(_folder: Path) -> bytes:
+    data = '<ExtendedData><Data name="H"><value>{}</value></Data></ExtendedData>'
+    marks = [_placemark(str(k), _point(f"8.4{k},49.0,0"), data.format(height)) for k, height in enumerate(HEIGHTS)]
+    return _kml(*marks).encode()
+
+
+def _wkt(_folder: Path) -> bytes:
+    """With a decimal comma in the column alone."""
+    rows = [f"POINT({x} {y});{str(h).replace('.', ',')}" for (x, y), h in zip(PLACES, HEIGHTS, strict=True)]
+    return "\n".join(["geom;H", *rows]).encode()
+
+
+@pytest.mark.parametrize("is_declared", [True, False])
+@pytest.mark.parametrize(
+    "write",
+    [
+        _gpkg,
+        _dxf,
+        _kml_with_data,
+        lambda _folder: _geojson(HEIGHTS).encode(),
+        lambda _folder: _geojson(HEIGHTS, [0.0, 0.0, 0.0]).encode(),
+        _wkt,
+    ],
+    ids=["gpkg", "dxf", "kml", "geojson", "zeros", "wkt"],
+)
+def test_a_column_of_heights_beside_plane_geometry(write: Any, is_declared: bool, tmp_path: Path) -> None:
+    data = write(tmp_path)
+    crs = "EPSG:4326" if b"<kml" in data else "EPSG:25832"
+    column = {"height": "hoehe" if b"HOEHE" in data else "H"}
+    read = _read(data, crs=crs, vertical_datum="ellipsoid", columns=column if is_declared else {})
+    assert read.height is not None
+    assert read.height.tolist() == HEIGHTS
+    assert not read.faults.counts
+    with pytest.raises(InvalidParameter, match="vertical datum is not declared"):
+        _read(data, crs=crs)
+    assert _read(data, crs=crs, ignore_heights=True).height is None
+    assert _read(data, crs=crs, columns={"height": None}).height is None
+
+
+def test_two_heights_that_disagree_are_warned_of() -> None:
+    z = [130.5, 131.3, 179.75]
+    declared = {"crs": "EPSG:25832", "vertical_datum": "ellipsoid"}
+    for columns, used, change in (({}, z, "H"), ({"height": "H"}, HEIGHTS, None)):
+        read = _read(_geojson(HEIGHTS, z), columns=columns, **declared)
+        assert read.height is not None
+        assert read.height.tolist() == used
+        (warning,) = read.faults.shown(9)
+        assert (warning.code, warning.row, warning.changes[0].value) == ("heights_disagree", None, change)
+        assert "1 heights of the geometry differ from the column 'H', by up to 50.00" in warning.message
+    rounded = _read(_geojson([*HEIGHTS[:2], None], [130.5, 131.3, 129.7]), columns={"height": "H"}, **declared)
+    assert not rounded.faults.counts
+    assert rounded.height is not None
+    assert rounded.height.tolist() == [130.5, 131.25, 129.7]
+
+
+def test_a_column_that_is_only_named_like_heights_is_not_read() -> None:
+    read = _read(_geojson(["left", "right", "left"]), crs="EPSG:25832")
+    assert (read.height, read.faults.counts) == (None, {"role_without_evidence": 1})
+    wrong = _read(_geojson(["130.5", "131.25", "about 130"]), crs="EPSG:25832", vertical_datum="ellipsoid")
+    assert [(fault.row, fault.code) for fault in wrong.faults.shown(9)] == [(3, "not_a_number")]
+
+
+@pytest.mark.parametrize("role", ["easting", "lat_deg"])
+def test_no_column_can_be_declared_for_coordinates_of_geometry(role: str) -> None:
+    with pytest.raises(InvalidParameter, match="those of the file's geometry") as refused:
+        _read(_geojson(HEIGHTS), crs="EPSG:25832", columns={role: "H"})
+    assert refused.value.field == f"columns.{role}"
