@@ -97,7 +97,8 @@ def _check_whole(
 ) -> list[Fault]:
     """One fault for the file if most rows are in the wrong place, with the reading that would correct it."""
     placed = survey.placed.placed
-    kept = max(survey.table.rows - len(declaration.leave_out), 1)
+    finite = np.isfinite(survey.table.first) & np.isfinite(survey.table.second)  # of the rows that are not left out
+    kept = max(int(finite.sum()), 1)
     if declaration.area_deg is not None:
         if placed.any() and outside.sum() <= 0.5 * placed.sum():
             return []

@@ -378,7 +378,9 @@ def _gis(rng: Rng) -> tuple[str | bytes, Check]:
             name = escape(str(rng.choice(["P & Q", "<1>", f"P{k}"])))
             gap = str(rng.choice(["", "\n   "]))
             text = f"{gap}{','.join(map(repr, row))}{gap}"
-            rows += f"<Placemark><name>{name}</name><Point><coordinates>{text}</coordinates></Point></Placemark>"
+            mode = "<altitudeMode>absolute</altitudeMode>" if len(row) == 3 else ""
+            point = f"<Point>{mode}<coordinates>{text}</coordinates></Point>"
+            rows += f"<Placemark><name>{name}</name>{point}</Placemark>"
     if kind == "gpx":
         track = "<trk><trkseg>" + '<trkpt lat="1" lon="2"/>' * int(rng.integers(0, 3)) + "</trkseg></trk>"
         text = f'<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1" version="1.1">{rows}{track}</gpx>'

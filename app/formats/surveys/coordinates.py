@@ -145,12 +145,17 @@ def share_inside(easting: Floats, northing: Floats, declaration: ImportDeclarati
 PAIRS = (("lon_deg", "lat_deg"), ("easting", "northing"))
 _SAMPLE = 1000  # cells of a column by which the form of its numbers is detected
 _BLANKS = {" ": "blanks", "\u00a0": "no-break spaces", "\u2009": "thin spaces", "\u202f": "narrow no-break spaces"}
-_WKT = re.compile(r"\s*(?:SRID=[0-9]+;)?\s*(?:MULTI)?POINT\b.*|0[01][0-9A-Fa-f]{40,}", re.IGNORECASE | re.DOTALL)
+_WKT = re.compile(  # also with the marks of Z and M, and WKB as PostGIS or its `bytea` write it
+    r"\s*(?:SRID=[0-9]+;)?\s*(?:MULTI)?POINT(?:\s*(?:ZM?|M))?\b.*|(?:\\x)?0[01][0-9A-Fa-f]{40,}",
+    re.IGNORECASE | re.DOTALL,
+)
 _SRID = re.compile(r"SRID=([0-9]{4,6});", re.IGNORECASE)
 _AGREE_M = 5.0
 """Difference between two pairs of coordinates of a row that the datums of a continent explain. [m] Above NAD83 - WGS 84
 (1 to 2 m) and the rounding of five decimals of a degree, below NAD27 or ED50 (30 to 200 m)."""
 _IGNORED = (Change("ignore_heights", True),)
+_NO_COLUMN = Change("columns.height", None)
+_ROUNDED = 0.06  # difference of a height from the same one rounded to a tenth of its unit
 _FEW = 4  # rows whose heights may be equal by chance
 _MIN_SHARE = 0.5  # [1] of the rows that must lie in an area for their order to be possible
 _SYSTEM_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "datum", "coordinatesystem", "koordinatensystem")
@@ -192,13 +197,15 @@ def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places
         No two columns hold coordinates.
     """
     if source.points is not None:
-        return _with_plausible_heights(Coordinates(*source.points, None), declaration)
+        of_geometry = _with_column_of_heights(Coordinates(*source.points, None), source, declaration, places)
+        return _with_plausible_heights(of_geometry, declaration)
     pair = _choose_pair(source, declaration, places)
     if pair is None:
         wkt = _wkt_column(source)
         if wkt is None:
             raise _not_identified(source)
-        return _with_plausible_heights(_from_wkt(source, wkt), declaration)
+        of_geometry = _with_column_of_heights(_from_wkt(source, wkt), source, declaration, places)
+        return _with_plausible_heights(of_geometry, declaration)
     form, shown = _form(source, declaration, places)
     is_sexagesimal = all(are_sexagesimal(_sample_of(source, places[role])) for role in PAIRS[0])
     values = [_numbers(source, places, role, form, is_sexagesimal) for role in (*pair, "height")]
@@ -209,10 +216,7 @@ def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places
     read = Coordinates(first, second, height, pair == PAIRS[1], form, is_sexagesimal, faults=faults, places=places)
     if is_sexagesimal:
         read.detected.append(Detected("degrees", "degrees, minutes, seconds", "the signs in most of the values"))
-    if shown:
-        group = _BLANKS.get(form.group, form.group)
-        value = form.decimal + (f", with {group} between groups of three digits" if form.group else "")
-        read.detected.append(Detected("decimal sign", value, f"most numbers are written like {shown!r}"))
+    read.detected += _detected_form(form, shown)
     used = set(places.values())
     if (stated := _check_one_system(source, used, declaration)) is not None:
         read.crs, found = stated
@@ -312,6 +316,14 @@ def _form(source: SourceTable, declaration: ImportDeclaration, places: dict[str,
     sample = chain.from_iterable(_sample_of(source, k) for role, k in places.items() if _holds_numbers(role))
     form, shown = detect_number_form(islice(sample, _SAMPLE * len(texts)), declaration.decimal)
     return form, shown if declaration.decimal is None or form.group else ""
+
+
+def _detected_form(form: NumberForm, shown: str) -> list[Detected]:
+    if not shown:
+        return []
+    group = _BLANKS.get(form.group, form.group)
+    value = form.decimal + (f", with {group} between groups of three digits" if form.group else "")
+    return [Detected("decimal sign", value, f"most numbers are written like {shown!r}")]
 
 
 def _holds_numbers(role: str) -> bool:
@@ -503,7 +515,7 @@ def _wkt_column(source: SourceTable) -> int | None:
 
 
 def _from_wkt(source: SourceTable, column: int) -> Coordinates:
-    texts = [cell_text(value) for value in source.columns[column]]
+    texts = [cell_text(value).removeprefix("\\x") for value in source.columns[column]]
     first = next(text for text in texts if text)
     is_hex = first[0] == "0"
     read: Any = shapely.from_wkb if is_hex else shapely.from_wkt
@@ -525,6 +537,48 @@ def _from_wkt(source: SourceTable, column: int) -> Coordinates:
     detected = [Detected("coordinates", "geometry", evidence)]
     crs = f"EPSG:{srid}" if srid else None
     return Coordinates(x, y, z, None, crs=crs, faults=faults, detected=detected)
+
+
+def _with_column_of_heights(
+    read: Coordinates, source: SourceTable, declaration: ImportDeclaration, places: dict[str, int | None]
+) -> Coordinates:
+    """With the heights of a column beside geometry: where the geometry has none, or where the column is declared."""
+    column = places["height"]
+    if column is None or declaration.ignore_heights:
+        return read
+    form, shown = _form(source, declaration, places)
+    values, faults = _numbers(source, places, "height", form)
+    assert values is not None
+    name, is_declared = source.names[column].strip()[:60], bool(declaration.columns.get("height"))
+    there = np.isfinite(values)
+    if not is_declared and len(faults) > there.sum():
+        message = f"the column {name!r} was not read as height: most of its values are no numbers"
+        cure = f'declare columns {{"height": "{name}"}} if it is, or {{"height": null}} if it is not'
+        read.faults.append(warn(None, "height", "role_without_evidence", message, cure, (_NO_COLUMN,)))
+        return read
+    if not there.any() and not faults:
+        return read
+    z = np.full(len(values), np.nan) if read.height is None else read.height
+    has_z = bool(np.any(z[np.isfinite(z)]))
+    common = there & np.isfinite(z)
+    apart = np.abs(values - z, where=common, out=np.zeros(len(z)))
+    differ = int((apart > _ROUNDED).sum()) if has_z else 0
+    if differ:
+        used, others = ("column, which is declared,", "geometry") if is_declared else ("geometry", "column")
+        message = (
+            f"{differ} heights of the geometry differ from the column {name!r}, by up to {apart.max():.2f};"
+            f" those of the {used} are used"
+        )
+        change = _NO_COLUMN if is_declared else Change("columns.height", source.names[column])
+        cure = f"declare columns.height {'null' if is_declared else name} if those of the {others} are right"
+        read.faults.append(warn(None, "height", "heights_disagree", message, cure, (change,)))
+    first, second = (values, z) if is_declared or not has_z else (z, values)
+    agree = has_z and not differ and common.any()
+    read.height = np.where(np.isnan(first), second, first) if agree else first
+    if first is values:
+        read.form, read.faults = form, [*read.faults, *faults]
+        read.detected += _detected_form(form, shown)
+    return read
 
 
 def points_of(shapes: Any, start: int = 0) -> tuple[tuple[Floats, Floats, Floats], list[Fault]]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from app.errors import InvalidParameter
-from app.formats.surveys.declaration import NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
+from app.formats.surveys.declaration import COORDINATE_ROLES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
 from app.formats.surveys.table import STATION, Change, Detected, Fault, SourceTable, warn
 from app.markers.reading import STATUSES
 
@@ -170,6 +170,7 @@ _NAMES = {
 }  # fmt: skip
 """Names of columns as survey software writes them, in English, German and Spanish; the first that is there is taken."""
 _ELLIPSOIDAL = ("ellipsoidalheight", "ellipsoidheight", "ellheight", "ellipsheight", "hell", "ellh")
+_OWN_SYSTEM = frozenset({"geometry_vertical_datum", "geom_vdatm"})  # columns of our own exports
 WKT_NAMES = ("wkt", "wktgeom", "geom", "geometry", "thegeom", "geomwkt")
 _SAMPLE = 2000  # values by which a column is recognised
 _MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows
@@ -226,7 +227,9 @@ def find_roles(source: SourceTable, declaration: ImportDeclaration, code_form: C
     for role in (*_NAMES, *TEXT_ROLES, *NUMBER_ROLES):
         if role in roles.places:
             continue
-        if role in declaration.columns:
+        if source.points is not None and _is_of_geometry(source, role, declaration):
+            roles.places[role] = None
+        elif role in declaration.columns:
             roles.places[role] = _declared(source, role, declaration.columns[role])
         else:
             roles.places[role] = _detected(source, role, declaration, taken, code_form, roles)
@@ -235,6 +238,27 @@ def find_roles(source: SourceTable, declaration: ImportDeclaration, code_form: C
         shown = ", ".join(unread[:_MAX_SHOWN]) + (" and others" if len(unread) > _MAX_SHOWN else "")
         roles.detected.append(Detected("columns without a role", shown[:300], "their names, or their values"))
     return roles
+
+
+def _is_of_geometry(source: SourceTable, role: str, declaration: ImportDeclaration) -> bool:
+    """Whether a file with geometry has this role in it alone: coordinates, and heights of our own exports.
+
+    Raises
+    ------
+    InvalidParameter
+        A column is declared for coordinates that the geometry has.
+    """
+    declared = declaration.columns.get(role)
+    if role == "height":  # `height_m` of an export is that of the registry, its geometry may be in another system
+        return role not in declaration.columns and not _OWN_SYSTEM.isdisjoint(source.names)
+    if role in COORDINATE_ROLES and declared:
+        raise InvalidParameter(
+            f"the coordinates are those of the file's geometry, not of the column {declared[:60]!r}",
+            field=f"columns.{role}",
+            limit="files without geometry",
+            cure=f"leave columns.{role} out, or send the table as CSV without the geometry",
+        )
+    return role in COORDINATE_ROLES
 
 
 def _declared(source: SourceTable, role: str, wanted: str | None) -> int | None:

@@ -10,11 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.errors import UnreadableUpload
+from app.errors import ReferenceSystemError, UnreadableUpload
 from app.formats.format import ArchiveLimits, read_members
 from app.formats.surveys.declaration import FEET
 from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, Faults, SourceTable, warn
 from app.formats.xml_tree import MAX_BYTES, check_xml, local_name
+from app.geodesy import normalize_crs, reference_system
+from app.geodesy.systems import split_heights
 
 MAX_ELEMENTS = 20 * MAX_ROWS
 """Elements of a document."""
@@ -26,7 +28,10 @@ _LANDXML_UNITS = {"meter": "m", "foot": FEET, "ussurveyfoot": "ft-us"}
 
 
 def read_kml(data: bytes) -> SourceTable:
-    """Placemarks that are points; their names, descriptions and data are columns. Longitude first, as KML has it.
+    """Points of placemarks, one row for each point of a MultiGeometry; their names, descriptions and data are columns.
+
+    Longitude first, as KML has it. Altitudes are heights where their mode is ``absolute``; the others, also those
+    without a mode, are above the ground, or mean nothing (OGC KML 2.2, altitudeModeEnumType).
 
     Raises
     ------
@@ -36,14 +41,27 @@ def read_kml(data: bytes) -> SourceTable:
     rows: list[dict[str, object]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
+    above_ground = 0
     for placemark in elements(data, "Placemark"):
-        text = next((e.text or "" for e in _below(placemark, "Point") for e in _below(e, "coordinates")), "")
-        point = _numbers(text.split(","))
-        rows.append(_kml_values(placemark))
-        if point is None or len(point) not in (2, 3):
-            faults.append(Fault(len(rows), "geometry", "no_point", "the placemark is no point with finite numbers"))
-            point = [math.nan, math.nan]
-        points.append((point[0], point[1], point[2] if len(point) == 3 else math.nan))
+        values = _kml_values(placemark)
+        for element in list(_below(placemark, "Point")) or [ET.Element("Point")]:
+            point = _numbers(_text_of(element, "coordinates").split(","))
+            rows.append(values)
+            if point is None or len(point) not in (2, 3):
+                faults.append(Fault(len(rows), "geometry", "no_point", "the placemark is no point with finite numbers"))
+                point = [math.nan, math.nan]
+            height = point[2] if len(point) == 3 else math.nan
+            if math.isfinite(height) and _text_of(element, "altitudeMode").strip() != "absolute":
+                above_ground += height != 0
+                height = math.nan
+            points.append((point[0], point[1], height))
+    if above_ground:
+        message = (
+            f"{above_ground} altitudes are above the ground or without meaning, as altitudeMode states, which is"
+            " clampToGround where it is missing; they were left out"
+        )
+        cure = "if they are heights above the vertical datum, write altitudeMode absolute into each Point"
+        faults.append(warn(None, "height", "altitude_mode", message, cure))
     return _table("kml", rows, points, faults, crs="EPSG:4326")
 
 
@@ -117,8 +135,10 @@ def read_landxml(data: bytes) -> SourceTable:
     for element in elements(data, "CgPoint", "CoordinateSystem", "Metric", "Imperial"):
         kind = local_name(element.tag)
         if kind == "CoordinateSystem":
-            code = element.get("epsgCode")
-            crs = f"EPSG:{code}" if code else crs
+            code = element.get("epsgCode", "").strip()
+            if code:
+                crs, problem = _landxml_crs(code)
+                faults += problem
         elif kind != "CgPoint":
             unit = _linear_unit(element.get("linearUnit", ""))
             height_unit = _elevation_unit(element.get("elevationUnit", ""), unit)
@@ -130,6 +150,21 @@ def read_landxml(data: bytes) -> SourceTable:
                 found = [math.nan, math.nan]
             points.append((found[1], found[0], found[2] if len(found) == 3 else math.nan))
     return replace(_table("landxml", rows, points, faults, crs=crs, unit=unit), height_unit=height_unit)
+
+
+def _landxml_crs(code: str) -> tuple[str | None, list[Fault]]:
+    """The CRS of an epsgCode; none, and a warning, where it cannot be used."""
+    try:
+        crs = normalize_crs(code if code.upper().startswith("EPSG:") else f"EPSG:{code}")
+        horizontal, _heights = split_heights(crs)
+        if "[" not in horizontal:
+            reference_system(horizontal)
+    except ReferenceSystemError as error:
+        message = f"the epsgCode {code[:20]!r} of the file cannot be used: {error.message}"
+        return None, [
+            warn(None, "crs", "unusable_crs", message, "check the declared crs: the file does not confirm it")
+        ]
+    return crs, []
 
 
 def _linear_unit(name: str) -> str:
@@ -196,6 +231,10 @@ def _below(element: ET.Element, name: str) -> Iterator[ET.Element]:
     return (child for child in element.iter() if local_name(child.tag) == name)
 
 
+def _text_of(element: ET.Element, name: str) -> str:
+    return next((below.text or "" for below in _below(element, name)), "")
+
+
 def _kml_values(placemark: ET.Element) -> dict[str, object]:
     values: dict[str, object] = {}
     for child in placemark.iter():
@@ -242,11 +281,14 @@ _WGS84 = {"Latitude": "lat_deg", "Longitude": "lon_deg", "Height": "ellipsoidal_
 _TEXTS = {"Name": "point", "Code": "code", "SurveyMethod": "method"}
 _POOR = ("Float", "Code", "Autonomous", "SBAS", "Differential")
 """Ends of survey methods without fixed ambiguities: Trimble JobXML schema 5.3, SurveyMethodEnum."""
+_SHOWN = 10  # names of points in a report
 _NAMES = (*_TEXTS.values(), *_GRID.values(), *_WGS84.values())
 
 
 def read_jobxml(data: bytes) -> SourceTable:
     """Points below `Reductions`, which have been averaged and adjusted; lengths are in metres whatever the job shows.
+
+    Points that were deleted in the job are left out.
 
     Raises
     ------
@@ -255,17 +297,24 @@ def read_jobxml(data: bytes) -> SourceTable:
     """
     rows: list[dict[str, str | float | None]] = []
     without, faults = 0, Faults()
+    deleted: list[str] = []
     for point in elements(data, "Point"):
         row = _row(point)
-        if row is None:
+        if _is_deleted(point):
+            deleted.append(next((child.text or "" for child in point if local_name(child.tag) == "Name"), "").strip())
+        elif row is None:
             without += 1
         else:
             rows.append(row)
             faults.add(_check_method(len(rows), str(row["method"] or "")))
         check_size(len(rows), len(_NAMES))
     detected = [Detected("unit", "m", "JobXML has its lengths in metres")]
-    if without:
-        detected.append(Detected("other points", f"{without} left out", "points without coordinates"))
+    if without or deleted:
+        reasons = ["points without coordinates"] if without else []
+        if deleted:
+            shown = ", ".join(name[:40] for name in deleted[:_SHOWN]) + (" and others" if deleted[_SHOWN:] else "")
+            reasons.append(f"{len(deleted)} deleted in the job: {shown}")
+        detected.append(Detected("other points", f"{without + len(deleted)} left out", "; ".join(reasons)))
     names = tuple(name for name in _NAMES if any(row[name] is not None for row in rows))
     columns = tuple([row[name] for row in rows] for name in names)
     return SourceTable("jobxml", names, columns, unit="m", faults=faults, detected=tuple(detected))
@@ -280,6 +329,12 @@ def _check_method(row: int, method: str) -> list[Fault]:
         message = f"the point was measured with {method}: decimetres to metres"
         return [warn(row, "point", "poor_solution", message, "measure it again with fixed ambiguities")]
     return []
+
+
+def _is_deleted(point: ET.Element) -> bool:
+    """Whether the classification, such as ``DeletedNormal``, says so."""
+    texts = (child.text or "" for child in point if local_name(child.tag) == "Classification")
+    return any(text.strip().lower().startswith("deleted") for text in texts)
 
 
 def _row(point: ET.Element) -> dict[str, str | float | None] | None:

@@ -868,6 +868,7 @@ export default {
   "home.welcome": "Straßenmarker von {agency}",
 
   "import_fault.already_registered": "Schon registriert",
+  "import_fault.altitude_mode": "Höhen über dem Gelände",
   "import_fault.beside_the_registered_line": "Neben den registrierten Markern",
   "import_fault.coarse_accuracy": "Grobe Genauigkeit",
   "import_fault.code_taken": "Code ist vergeben",
@@ -884,6 +885,7 @@ export default {
   "import_fault.height_out_of_range": "Höhe außerhalb des Bereichs",
   "import_fault.height_shift": "Höhen sind verschoben",
   "import_fault.height_step": "Sprung in den Höhen",
+  "import_fault.heights_disagree": "Höhen widersprechen sich",
   "import_fault.hemisphere_letter": "Buchstabe statt Vorzeichen",
   "import_fault.hidden_layers": "Layer, die nicht gezeichnet sind",
   "import_fault.isolated": "Weit von allen anderen",
@@ -911,6 +913,7 @@ export default {
   "import_fault.systematic_shift": "Systematische Verschiebung",
   "import_fault.unit_in_header": "Andere Einheit in der Kopfzeile",
   "import_fault.unit_in_value": "Einheit im Wert",
+  "import_fault.unusable_crs": "Bezugssystem der Datei unbrauchbar",
   "import_fault.which_foot": "Welcher Fuß?",
   "import_fault.wrong_sign": "Falsches Vorzeichen",
   "import_fault.wrong_unit": "Falsche Einheit",

@@ -868,6 +868,7 @@ export default {
   "home.welcome": "Road markers of {agency}",
 
   "import_fault.already_registered": "Registered already",
+  "import_fault.altitude_mode": "Altitudes above the ground",
   "import_fault.beside_the_registered_line": "Beside the registered markers",
   "import_fault.coarse_accuracy": "Coarse accuracy",
   "import_fault.code_taken": "Code is taken",
@@ -884,6 +885,7 @@ export default {
   "import_fault.height_out_of_range": "Height out of range",
   "import_fault.height_shift": "Heights are shifted",
   "import_fault.height_step": "Step in the heights",
+  "import_fault.heights_disagree": "Heights disagree",
   "import_fault.hemisphere_letter": "Letter instead of a sign",
   "import_fault.hidden_layers": "Layers that are not drawn",
   "import_fault.isolated": "Far from all others",
@@ -911,6 +913,7 @@ export default {
   "import_fault.systematic_shift": "Systematic shift",
   "import_fault.unit_in_header": "Another unit in the header",
   "import_fault.unit_in_value": "Unit in the value",
+  "import_fault.unusable_crs": "Reference system of the file cannot be used",
   "import_fault.which_foot": "Which foot?",
   "import_fault.wrong_sign": "Wrong sign",
   "import_fault.wrong_unit": "Wrong unit",

@@ -30,7 +30,8 @@ def geojson() -> bytes:
 
 def kml() -> bytes:
     marks = "".join(
-        f"<Placemark><name>{n}</name><Point><coordinates>{x},{y},{z}</coordinates></Point></Placemark>"
+        f"<Placemark><name>{n}</name><Point><altitudeMode>absolute</altitudeMode>"
+        f"<coordinates>{x},{y},{z}</coordinates></Point></Placemark>"
         for n, x, y, z in POINTS
     )
     return f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{marks}</Document></kml>'.encode()
