@@ -15,7 +15,7 @@ import numpy as np
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.formats.format import NAME_LENGTH, Sample
-from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, check_datum
+from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, check_datum, in_hemisphere
 from app.formats.poses import ALIASES, PoseDeclaration
 from app.formats.text import clean_text, match_columns, read_number
 from app.sensors.pose_track import find_jumps
@@ -177,7 +177,11 @@ def _frame_of(values: Mapping[str, object], declaration: PoseDeclaration, clock:
         value = values.get(quantity)
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e9:
             return math.nan
-        return float(value)
+        side = f"{quantity}_hemisphere"
+        try:
+            return in_hemisphere(float(value), values[side], side) if side in values else float(value)
+        except ValueError:
+            return math.nan
 
     name = values.get("file")
     accuracy_m, heading_deg = number("accuracy"), number("heading")

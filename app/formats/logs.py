@@ -302,6 +302,37 @@ def has_zone(text: str) -> bool:
     return re.search(r"(?:[zZ]|[ Tt]\d\d.*[+-]\d\d(?::?\d\d)?)\s*\Z", text) is not None
 
 
+# === Positions in logs: degrees with a column of hemispheres.
+
+
+HEMISPHERES: dict[str, tuple[str, ...]] = {
+    "lat_hemisphere": (
+        "n_s", "ns", "lat_hemisphere", "latitude_hemisphere", "lat_ns", "lat_n_s", "lat_ref", "latref", "latituderef",
+        "latitude_ref", "lat_dir", "latdir", "latitude_direction", "lat_direction",
+    ),
+    "lon_hemisphere": (
+        "e_w", "ew", "lon_hemisphere", "longitude_hemisphere", "lon_ew", "lon_e_w", "lon_ref", "lonref", "longituderef",
+        "longitude_ref", "lon_dir", "londir", "longitude_direction", "lon_direction",
+    ),
+}  # fmt: skip
+"""Names of columns that hold N or S, E or W, beside degrees without a sign."""
+_SIGNS = {"lat_hemisphere": {"N": 1.0, "S": -1.0}, "lon_hemisphere": {"E": 1.0, "W": -1.0}}
+
+
+def in_hemisphere(value_deg: float, letter: object, quantity: str) -> float:
+    """Degrees with the sign of their hemisphere.
+
+    Raises
+    ------
+    ValueError
+        The letter is none of the two, or the degrees have a sign already.
+    """
+    sign = _SIGNS[quantity].get(str(letter).strip().upper())
+    if sign is None or value_deg < 0:
+        raise ValueError(f"{letter!r} is no hemisphere of degrees without a sign")
+    return sign * value_deg
+
+
 # === The datum of positions in logs: they must be in WGS 84 / ITRF.
 
 

@@ -18,7 +18,7 @@ from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, list_accepted
-from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport, check_datum
+from app.formats.logs import ACCEPTED_TIMES, HEMISPHERES, LogClock, LogReport, check_datum, in_hemisphere
 from app.formats.nmea import looks_like_nmea, read_nmea
 from app.formats.text import clean_text, read_number
 from app.inputs import Declaration, Name, Number
@@ -49,6 +49,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
         "sigma_m", "std_m", "horizontal_std_m",
     ),
     "crs": ("crs", "datum", "srs"),
+    **HEMISPHERES,
 }  # fmt: skip
 
 
@@ -215,7 +216,7 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
         try:
             point = _point_of(entry, cells, places, clock, log.dialect.decimal)
         except (ValueError, OverflowError):
-            report.leave_out(entry, "malformed", "the row holds text where numbers are expected")
+            report.leave_out(entry, "malformed", "the row holds text where numbers or hemispheres are expected")
             continue
         if math.isnan(point.time_s) and cells[places["time"]].strip():
             written = clean_text(cells[places["time"]], 40)
@@ -232,7 +233,9 @@ def read_csv(source: PoseSource) -> Iterator[PosePoint]:
 def _point_of(entry: int, cells: list[str], places: Mapping[str, int], clock: LogClock, decimal: str) -> PosePoint:
     def figure(quantity: str) -> float:
         place = places.get(quantity)
-        return math.nan if place is None else read_number(cells[place], decimal)
+        value = math.nan if place is None else read_number(cells[place], decimal)
+        side = f"{quantity}_hemisphere"
+        return in_hemisphere(value, cells[places[side]], side) if side in places and not math.isnan(value) else value
 
     written = cells[places["time"]]
     at_s = clock.read(written.replace(",", ".") if decimal == "," else written)

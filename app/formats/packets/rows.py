@@ -16,7 +16,7 @@ from pydantic import Field, field_validator
 
 from app.errors import InvalidParameter
 from app.formats.format import Sample
-from app.formats.logs import ACCEPTED_TIMES, LogClock, LogReport
+from app.formats.logs import ACCEPTED_TIMES, HEMISPHERES, LogClock, LogReport, in_hemisphere
 from app.formats.text import MAX_LINE, clean_text, numbered_lines, read_number, repeated_names
 from app.geodesy import check_lon_lat
 from app.inputs import Declaration, Name
@@ -60,6 +60,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "device": ("dev_eui", "deveui", "device_id", "device", "device_name", "sender"),
     "event": ("event", "event_id", "uplink_id", "deduplication_id", "deduplicationid"),
     "crs": ("crs", "datum", "srs"),
+    **HEMISPHERES,
 }  # fmt: skip
 """Names of the columns of a quantity, the likeliest first."""
 NEEDED = ("number", "lon", "lat")
@@ -197,6 +198,13 @@ def _read_claim(values: Mapping[str, object], decimal: str) -> PlainClaim:
     lat_deg = _number("latitude", values.get("lat"), -1e6, 1e6, decimal)
     if math.isnan(lon_deg) or math.isnan(lat_deg):
         raise BrokenEntry("empty", "there is neither a payload nor a position")
+    try:
+        if "lat_hemisphere" in values:
+            lat_deg = in_hemisphere(lat_deg, values["lat_hemisphere"], "lat_hemisphere")
+        if "lon_hemisphere" in values:
+            lon_deg = in_hemisphere(lon_deg, values["lon_hemisphere"], "lon_hemisphere")
+    except ValueError as error:
+        raise BrokenEntry("position", str(error)) from None
     try:
         check_lon_lat(lon_deg, lat_deg)
     except InvalidParameter as error:

@@ -192,6 +192,14 @@ def test_no_times(written: object) -> None:
     assert math.isnan(LogClock().read(written))
 
 
+def test_hemispheres_beside_degrees_without_a_sign() -> None:
+    log = read("id,lat,N/S,lon,E/W\n1,33.5,S,70.6,W\n2,33.5,X,70.6,W\n")
+    (packet,) = log.packets
+    assert packet.claim is not None
+    assert (packet.claim.lat_deg, packet.claim.lon_deg) == (-33.5, -70.6)
+    assert "hemisphere" in log.report.left_out[0].reason
+
+
 def test_gps_time_at_leap_seconds() -> None:
     # IERS bulletin C 52: UTC - TAI was -36 s until 2017-01-01, -37 s from then on; TAI - GPS is 19 s
     assert utc_from_gps_s(1_167_264_016) == datetime(2016, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()

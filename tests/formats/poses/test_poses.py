@@ -447,6 +447,16 @@ def test_headings_that_do_not_fit_the_travel_are_reported(scale: float, shift: f
     assert any("headings and the direction of travel" in warning for warning in report.warnings) == warned
 
 
+@pytest.mark.parametrize("names", ["N/S,E/W", "NS,EW", "LatRef,LonRef", "lat_dir,lon_dir", "Latitude Hemisphere,E/W"])
+def test_hemispheres_beside_degrees_without_a_sign(names: str) -> None:
+    south, west = names.split(",")
+    rows = "2026-03-16T13:39:32Z,33.5,S,70.6,W\n2026-03-16T13:39:33Z,33.6,s,70.7,w\n2026-03-16T13:39:34Z,33.7,S,-70.7,W"
+    track, report = read(f"time,latitude,{south},longitude,{west}\n{rows}")
+    assert track.lat_deg.tolist() == [-33.5, -33.6]
+    assert track.lon_deg.tolist() == [-70.6, -70.7]
+    assert "hemispheres" in report.left_out[0].reason, "two signs"
+
+
 def test_what_holds_no_track_is_named() -> None:
     route = GPX.replace("<trk><trkseg>{}</trkseg></trk>", '<rte><rtept lat="49" lon="8"/></rte>')
     with pytest.raises(UnreadableUpload, match="no track, but 1 routes and 0 waypoints"):
