@@ -57,7 +57,7 @@ def test_filters_order_and_view_are_kept_by_back_and_reload(watched: Watched, id
     page.get_by_text(f"{ALL} markers", exact=True).wait_for()
     page.get_by_role("search").get_by_label("Family").select_option("cerpm")
     page.get_by_text(f"{CERPMS} markers", exact=True).wait_for()
-    page.get_by_role("button", name="Measure [m]").click()
+    page.get_by_role("button", name="Measure", exact=True).click()
     page.get_by_role("button", name="Code").click()
     page.get_by_role("button", name="Code").click()
     first = page.locator("tbody a.code").first

@@ -86,7 +86,7 @@ def test_a_path_is_estimated_from_the_uploaded_files_and_the_registered_rows(
         assert side == recordings.side_of(rows[number])
     lines = {(line, recordings.line_of(rows[n])) for n, line in zip(markers.number, markers.line, strict=True)}
     assert len(lines) == len({line for line, _ in lines}) == len({name for _, name in lines}) == 3
-    assert {name for _, name in lines} == {(None, "1 left"), (None, "1 right"), (None, "2 right")}
+    assert {name for _, name in lines} == {("road", "1 left"), ("road", "1 right"), ("road", "2 right")}
 
 
 @pytest.mark.parametrize("name", ["1", "2"])
