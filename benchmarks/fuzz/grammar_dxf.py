@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
 from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile
 from app.formats.alignments.read import read_alignment
+from app.formats.surveys.declaration import Unit
 from app.formats.surveys.dxf_reader import read_dxf as read_survey
 from app.values import Floats
 from benchmarks.fuzz.courses import compare_warnings
@@ -115,7 +117,7 @@ def write_dxf(rng: Rng) -> tuple[bytes, Check]:
     text = drawing.text(code, "ANSI_1252")
 
     def check() -> str:
-        file = read_alignment(text, declaration=AlignmentDeclaration(unit=declared))  # type: ignore[arg-type]
+        file = read_alignment(text, declaration=AlignmentDeclaration(unit=cast("Unit | None", declared)))
         return _compare(file, drawing, unit_m)
 
     return text, check

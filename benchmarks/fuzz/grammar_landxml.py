@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 
 from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile, LaneGeometry, StationEquation
 from app.formats.alignments.read import read_alignment
+from app.formats.surveys.declaration import Unit
 from app.values import Floats
 from benchmarks.fuzz.courses import Course, Stretch, compare_plan, compare_warnings, integrate
 from benchmarks.fuzz.grammar import Check, Rng
@@ -118,7 +120,7 @@ def write_landxml(rng: Rng) -> tuple[bytes, Check]:
     text = _document(rng, unit, height, epsg, writer, found)
 
     def check() -> str:
-        file = read_alignment(text, declaration=AlignmentDeclaration(unit=declared))  # type: ignore[arg-type]
+        file = read_alignment(text, declaration=AlignmentDeclaration(unit=cast("Unit | None", declared)))
         return _compare(file, found, writer, warnings)
 
     return text, check

@@ -18,9 +18,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from xml.sax.saxutils import escape
 
-import ezdxf
 import numpy as np
 import shapely
+from ezdxf.filemanagement import new
 from pyproj import CRS, Transformer
 
 from app.formats.surveys.declaration import METRES, ImportDeclaration
@@ -98,27 +98,30 @@ def _check(data: bytes, points: Points, declared: dict[str, Any], tolerance_m: f
 
     def check() -> str:
         table = read_survey(data, ImportDeclaration(family="cerpm", **declared))
-        told = f"({json.dumps(declared, default=str)})"
+        sent = f"({json.dumps(declared, default=str)})"
         if table.faults.refuses_file or table.faults.flags(table.rows, Severity.REFUSED).any():
-            return f"refused: {[fault[:4] for fault in table.faults.shown(2)]} {told}"
+            return f"refused: {[fault[:4] for fault in table.faults.shown(2)]} {sent}"
         if table.rows != len(points.first):
-            return f"{table.rows} of {len(points.first)} rows {told}"
+            return f"{table.rows} of {len(points.first)} rows {sent}"
         own, found = _system(points.crs).geodetic_crs, _system(table.crs).geodetic_crs
-        assert own is not None and own.datum is not None and found is not None and found.datum is not None  # noqa: PT018
+        assert own is not None
+        assert own.datum is not None
+        assert found is not None
+        assert found.datum is not None
         if own.datum.name.removesuffix(" ensemble") != found.datum.name.removesuffix(" ensemble"):
-            return f"in {table.crs}, not in {points.crs} {told}"
+            return f"in {table.crs}, not in {points.crs} {sent}"
         factor = METRES[table.unit] / METRES[Points(table.crs, *points[1:]).unit] if table.unit != "deg" else 1.0
         lon, lat = _to_degrees(table.crs).transform(table.first * factor, table.second * factor)
         aim = _to_degrees(points.crs).transform(points.first, points.second)
         away_m = np.hypot((lon - aim[0]) * np.cos(np.radians(lat)), lat - aim[1]) * _DEGREE_M
         if not away_m.max() < tolerance_m:
-            return f"{away_m.max():.4f} m away, in {table.crs} and {table.unit} {told}"
+            return f"{away_m.max():.4f} m away, in {table.crs} and {table.unit} {sent}"
         if (table.height is None) != (points.height_m is None):
-            return f"heights: {table.height} {told}"
+            return f"heights: {table.height} {sent}"
         if table.height is not None and points.height_m is not None:
             apart_m = np.abs(table.height * METRES[table.height_unit] - points.height_m)
             if not apart_m.max() < 1e-3:
-                return f"heights {apart_m.max():.4f} m away, in {table.height_unit} {told}"
+                return f"heights {apart_m.max():.4f} m away, in {table.height_unit} {sent}"
         return ""
 
     return check
@@ -564,7 +567,7 @@ def _dxf(rng: Rng, points: Points, declared: dict[str, Any]) -> str:
     """Points or blocks; z is in the unit of the drawing, and 0 without heights."""
     unit, code = (("m", 6), ("ft-us", 21), ("mm", 4))[int(rng.integers(3))]
     factor = METRES[points.unit] / {**METRES, "mm": 0.001}[unit]
-    document = ezdxf.new("R2010", units=code)  # type: ignore[attr-defined]
+    document = new("R2010", units=code)
     document.header["$INSUNITS"] = code
     block = document.blocks.new("MARKER")
     block.add_attdef("NUMBER", (0, 0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends
 from starlette.responses import Response
@@ -246,7 +246,7 @@ def _parameters() -> dict[str, object]:
     }
 
 
-def _in_openapi_3_0(parameter: dict[str, Any]) -> dict[str, Any]:
+def _in_openapi_3_0(parameter: JsonObject) -> JsonObject:
     """A parameter whose schema has no examples: OpenAPI 3.0 has only one of them."""
     schema = dict(parameter["schema"])
     examples = schema.pop("examples", None)

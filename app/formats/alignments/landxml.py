@@ -443,8 +443,8 @@ def _read_spiral(
 def _both_sides(element: ET.Element, turned: Callable[[float], Piece], end: Point, scale: _Scale, place: str) -> _Shape:
     """A curve or spiral turned to both sides, and the side that its length or PI show.
 
-    With Start and End, the lines through the PI fix the turn, except of two arcs about a centre, of which one has the
-    same PI behind its start; the length or delta tells these apart.
+    With Start and End, the lines through the PI fix the turn. Two arcs about one centre have the same PI, which lies
+    behind the start of the longer one; their length or delta shows which of them is meant.
     """
     rot = element.get("rot", "").strip().lower()
     signs = (-1.0, 1.0) if rot == "cw" else (1.0, -1.0)

@@ -158,10 +158,10 @@ _NO_COLUMN = Change("columns.height", None)
 _ROUNDED = 0.06  # difference of a height from the same one rounded to a tenth of its unit
 _FEW = 4  # rows whose heights may be equal by chance
 _MIN_SHARE = 0.5  # [1] of the rows that must lie in an area for their order to be possible
-_SYSTEM_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "datum", "coordinatesystem", "koordinatensystem")
 _OF_REGISTRY = frozenset({"localization_grade", "survey_file_sha256"})
 """Columns of an export of Waymark, in which `crs` is the system of the original survey, not of the coordinates."""
 _EPSG_NAMES = ("epsg", "epsgcode", "srid", "crs", "srs", "coordinatesystem", "koordinatensystem")
+_SYSTEM_NAMES = (*_EPSG_NAMES, "datum")
 _ONE_CODE = re.compile(r"(?:EPSG ?:{0,2} ?)?([0-9]{4,6})", re.IGNORECASE)
 _ONE_ZONE = re.compile(r"(?:UTM)? ?(?:zone)? ?([0-9]{1,2}) ?[A-Z]?", re.IGNORECASE)
 _ZONE_NAMES = ("zone", "utmzone", "gridzone")

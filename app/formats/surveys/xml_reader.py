@@ -332,7 +332,7 @@ def _check_method(row: int, method: str) -> list[Fault]:
 
 
 def _is_deleted(point: ET.Element) -> bool:
-    """Whether the classification, such as ``DeletedNormal``, says so."""
+    """Whether the surveyor deleted the point: its classification is ``DeletedNormal`` or another that begins so."""
     texts = (child.text or "" for child in point if local_name(child.tag) == "Classification")
     return any(text.strip().lower().startswith("deleted") for text in texts)
 

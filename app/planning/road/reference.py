@@ -15,7 +15,7 @@ from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.alignments.geometry import AlignmentDeclaration, AlignmentFile
 from app.formats.surveys.declaration import METRES, choose_datum
 from app.geodesy import normalize_crs, place_positions, reference_system
-from app.geodesy.systems import HeightSystem, geographic_code, has_datum, is_global, split_heights
+from app.geodesy.systems import HeightSystem, geographic_code, has_datum, is_global, name_system, split_heights
 from app.values import Floats
 
 MAX_LOCAL_M = 200_000.0
@@ -30,7 +30,6 @@ _PROJ_KEYS = frozenset({
 _SAME_GRID_M = 1e-3  # [m] between the coordinates of two systems that are one grid
 _WKT = re.compile(r"\s*[A-Z][A-Z0-9_]*\s*[\[(]", re.IGNORECASE)
 _DROPPED_KEYS = ("geoidgrids", "geoid_crs")  # of heights, whose datum is declared
-_MIN_CONFIDENCE = 70  # [%] of pyproj's match with an EPSG code, as for surveys (app/formats/surveys/gis_reader.py)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +178,7 @@ def find_reference(file: AlignmentFile, declaration: AlignmentDeclaration, *, ha
 
 
 def _heights_of(crs: str) -> HeightSystem | None:
-    """What the CRS that a file states says about heights; PROJ strings say nothing that is used."""
+    """Vertical part of the CRS of a file; None without one, and for PROJ strings."""
     try:
         return split_heights(crs)[1]
     except ReferenceSystemError:
@@ -194,9 +193,7 @@ def _stated(crs: str) -> str:
             return name
     except (ReferenceSystemError, CRSError):
         name = crs
-    system = _horizontal(name)
-    code = system.to_epsg(min_confidence=_MIN_CONFIDENCE) if has_datum(system) else None
-    return f"EPSG:{code}" if code is not None else name
+    return name_system(_horizontal(name)) or name
 
 
 def _has_code(name: str) -> bool:
@@ -254,7 +251,7 @@ def _are_same(stated: str, declared: str) -> bool:
 
 
 def _have_same_grid(one: CRS, other: CRS) -> bool:
-    """Whether two systems differ in nothing but their datums: the declared one says which datum the file is in."""
+    """Whether two systems differ only in their datums."""
     if one.is_projected != other.is_projected or one.ellipsoid != other.ellipsoid:
         return False
     if not one.is_projected:
@@ -284,8 +281,7 @@ def _to_geographic(name: str, first: Floats, second: Floats) -> tuple[Floats, Fl
         first, second = Transformer.from_crs(system, geodetic, always_xy=True).transform(first, second)
     if is_global(system):
         return np.asarray(first), np.asarray(second), _CRS84, None
-    datum = geodetic.datum.name if geodetic.datum is not None else ""
-    code = geographic_code(geodetic) or _DATUMS.get(datum.removesuffix(" ensemble"))
+    code = geographic_code(geodetic)
     unknown = None if code else "the CRS of the file states no known datum"
     return np.asarray(first), np.asarray(second), code or _CRS84, unknown
 
@@ -299,10 +295,6 @@ def _with_shift(name: str) -> CRS | None:
         system.is_bound and system.coordinate_operation is not None and any(system.coordinate_operation.towgs84)
     )
     return system if is_shifted else None
-
-
-_DATUMS = {"North American Datum 1983": "EPSG:4269", "European Terrestrial Reference System 1989": "EPSG:4258"}
-"""Geographic systems whose datums PROJ strings name. Source: EPSG registry."""
 
 
 def _unit_m(system: CRS) -> float:

@@ -135,10 +135,7 @@ class Alignments:
                         "file_name": road.file_name,
                         **source,
                     },
-                    "summary": {
-                        **read.summary,
-                        "warnings": warnings,
-                    },
+                    "summary": {**read.summary, "warnings": warnings},
                 }
                 document = answer.store(alignment_document(ALIGNMENTS.add(connection, agency_id, values)))
                 add_lanes(connection, agency_id, document["id"], read.lanes)
