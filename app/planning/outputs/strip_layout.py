@@ -30,6 +30,7 @@ MAX_STRIPS = 3000
 _WANTED_SHEETS = {250: 12, 500: 40, 1000: 120, 2000: 240}
 """A scale is taken up to this many sheets, else the next one. What a crew carries."""
 _SHORTEST = 0.02  # of the greatest length, which a strip has at least
+_LEVEL_M = 1e-6  # between stations that neither rise nor fall
 _JUMP_M = 3.0  # between stations of neighbouring samples, which an equation makes; three steps
 _STRIPS_A_SHEET = 3
 _BESIDE_M = 30.0  # [m] from the reference lane, within which other lanes are in its strips; source: a carriageway
@@ -78,9 +79,14 @@ class Reference:
 
     def round_stations(self, step_m: float) -> tuple[Floats, Floats]:
         """`along_m` of the displayed stations that are multiples of a step, and these stations, shape (K,) each."""
-        jumps = np.flatnonzero(np.abs(np.diff(self.station_m)) > _JUMP_M) + 1
+        steps = np.diff(self.station_m)
+        jumps = np.flatnonzero(np.abs(steps) > _JUMP_M) + 1
+        rises = np.where(np.abs(steps) < _LEVEL_M, np.nan, np.sign(steps))
+        last = np.maximum.accumulate(np.where(np.isfinite(rises), np.arange(len(steps)), 0))
+        rises = np.nan_to_num(rises[last], nan=1.0)
+        turns = np.flatnonzero(rises[1:] != rises[:-1]) + 1  # from rising to falling stations, or back
         places, stations = [np.zeros(0)], [np.zeros(0)]
-        for run in np.split(np.arange(len(self.station_m)), jumps):
+        for run in np.split(np.arange(len(self.station_m)), np.union1d(jumps, turns)):
             sign = 1.0 if self.station_m[run[-1]] >= self.station_m[run[0]] else -1.0
             here = np.maximum.accumulate(sign * self.station_m[run])
             wanted = np.arange(np.ceil((here[0] - 1e-6) / step_m), np.floor((here[-1] + 1e-6) / step_m) + 1) * step_m

@@ -97,6 +97,17 @@ def test_a_tight_bend_is_cut_into_shorter_strips() -> None:
     assert max(strip.to_m - strip.from_m for strip in strips) < 0.8 * STRIP_MM / 1000 * strips[0].scale
 
 
+def test_stations_that_fall_are_numbered() -> None:
+    plan = plan_of(road(straight(300)), plates={})
+    turn = Stationing(1000.0, (StationEquation(155.5, 1155.5, 1155.5, -1.0),))
+    plan = replace(plan, alignment=replace(plan.alignment, stationing={plan.alignment.lanes[0].road: turn}))
+    places, stations = cut_strips(plan)[0].reference.round_stations(10.0)
+    wanted = {(at, 1000.0 + at if at < 155.5 else 1311.0 - at) for at in (*range(0, 151, 10), *range(161, 300, 10))}
+    assert {(round(at), round(station)) for at, station in zip(places.tolist(), stations.tolist(), strict=True)} == {
+        (round(at), round(station)) for at, station in wanted
+    }
+
+
 def test_long_roads_get_smaller_scales_and_few_sheets() -> None:
     scales = [cut_strips(plan_of(road(straight(metres)), plates={}))[0].scale for metres in (500, 15_000, 40_000)]
     assert scales == [250, 500, 1000]
