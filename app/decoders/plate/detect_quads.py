@@ -116,9 +116,8 @@ class Nearest(NamedTuple):
 def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     """Marker quadruples of a frame, best first, overlapping ones suppressed."""
     blobs = find_blobs(signal)
-    by_strength = np.argsort(-blobs[:, PEAK] * np.sqrt(blobs[:, AREA]), kind="stable")
-    reds = by_strength[blobs[by_strength, SIGN] > 0][:MAX_REDS]
-    greens = by_strength[blobs[by_strength, SIGN] < 0][:MAX_GREENS]
+    strength = blobs[:, SIGN] * blobs[:, PEAK] * np.sqrt(blobs[:, AREA])
+    reds, greens = _strongest(strength, MAX_REDS), _strongest(-strength, MAX_GREENS)
     quads, nearest = Quads.empty(MAX_QUADS), Nearest.empty()
     count = join_green_triples(blobs, greens, signal.opponent, nearest, quads)
     count = join_red_quads(blobs, reds, greens, nearest, quads, count)
@@ -135,6 +134,15 @@ def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     centroids_px = signal.scale * quads.centroids[kept] + (signal.scale - 1) / 2
     founds, size_ratios = quads.found[kept].tolist(), quads.size_ratio[kept].tolist()
     return [MarkerQuad(*values) for values in zip(centroids_px, founds, ranks[kept].tolist(), size_ratios, strict=True)]
+
+
+def _strongest(strength: Floats, most: int) -> Ints:
+    """Numbers of the blobs with the greatest positive strengths, the greatest first."""
+    found = np.flatnonzero(strength > 0)
+    if len(found) > most:
+        found = np.sort(found[np.argpartition(-strength[found], most)[:most]])
+    order: Ints = found[np.argsort(-strength[found], kind="stable")]
+    return order
 
 
 # === Joining of blobs: what three markers imply of the others.

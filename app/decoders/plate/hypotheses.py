@@ -125,7 +125,7 @@ class LightPrior(NamedTuple):
 class Spots(NamedTuple):
     """Spots of paint that may hide a unit."""
 
-    shapes: Floats  # shape (6, spots): [mm] centre around the unit's, inverse shape xx, xy, yy, mean radius
+    shapes: Floats32  # shape (6, spots): [mm] centre around the unit's, inverse shape xx, xy, yy, mean radius
     # `paints`, `opacities`: reflectances [white] and shares of the light that the paint hides
     paints: Floats
     opacities: Floats
@@ -143,7 +143,7 @@ MIN_UNIT_SHARE, MOST_UNITS = 0.003, 9
 """[1, units] share of a unit in a pixel below which it is left out, and units of a pixel at most."""
 EDGE_SLOPE = 1.702
 """[1] slope of the logistic function that is nearest to the normal distribution's."""
-MAX_DECAY = 40.0
+MAX_DECAY = np.float32(40.0)
 """[1] exponent beyond which an exponential counts as that of this."""
 MIN_PIVOT = 1e-7
 """[1] square of a diagonal entry of a factor at least, relative to the light. Source: rounding of single precision."""
@@ -195,10 +195,11 @@ def _column_square(matrix: Floats32, column: int) -> float:
 
 
 @routine
-def _exp_down(x: float) -> float:
-    """exp(-x) for x of 0 to 40 to a relative 1e-5, without branches: a series at x / 256, squared eight times."""
-    y = min(x, MAX_DECAY) * (-1.0 / 256.0)
-    value = 1.0 + y * (1.0 + y * (1.0 / 2.0 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y * (1.0 / 120.0)))))
+def _exp_down(x: np.float32) -> np.float32:
+    """exp(-x) for x of 0 to 40 to a relative 3e-5, without branches: a series at x / 256, squared eight times."""
+    y = min(x, MAX_DECAY) * np.float32(-1.0 / 256.0)
+    series = np.float32(1.0 / 2.0) + y * (np.float32(1.0 / 6.0) + y * np.float32(1.0 / 24.0))
+    value = np.float32(1.0) + y * (np.float32(1.0) + y * series)
     value *= value
     value *= value
     value *= value
@@ -218,15 +219,17 @@ def _distance2(places_mm: Floats, p: int, x_mm: float, y_mm: float) -> float:
 
 
 @routine
-def _set_cover(spots: Floats, x_mm: float, y_mm: float, blur_mm: float, cover: Floats) -> None:
+def _set_cover(spots: Floats32, x_mm: np.float32, y_mm: np.float32, by_blur: np.float32, cover: Floats32) -> None:
     """Set the share of a blurred point beside a unit's centre that each spot covers; `spots` has a row a property."""
-    for g in range(cover.size):
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for spot in range(cover.size):
+        g = np.uint64(spot)
         x = x_mm - spots[0, g]
         y = y_mm - spots[1, g]
-        radius = math.sqrt(spots[2, g] * x * x + 2.0 * spots[3, g] * x * y + spots[4, g] * y * y)
-        inside = EDGE_SLOPE * (1.0 - radius) * spots[5, g] / blur_mm
-        away = 1.0 / (1.0 + _exp_down(abs(inside)))
-        cover[g] = away if inside > 0.0 else 1.0 - away
+        radius2 = spots[2, g] * x * x + np.float32(2.0) * spots[3, g] * x * y + spots[4, g] * y * y
+        inside = (one - math.sqrt(max(radius2, zero))) * spots[5, g] * by_blur
+        away = one / (one + _exp_down(abs(inside)))
+        cover[g] = away if inside > zero else one - away
 
 
 @step
@@ -261,17 +264,17 @@ class Local(NamedTuple):
     """The pixels around one unit, their light and covariances relative to the mean light."""
 
     # `x_mm`, `y_mm`: shape (size,): from the unit's centre
-    x_mm: Floats
-    y_mm: Floats
+    x_mm: Floats32
+    y_mm: Floats32
     # `seen`, `flipped`, `share`: shape (size,): reflectance that each pixel sees of the pattern, and with the unit
     # flipped; share of the unit
-    seen: Floats
-    flipped: Floats
-    share: Floats
-    reach: Floats  # shape (size,): what the distance from the unit takes off a smooth stain
-    noise: Floats  # shape (size,)
-    units: Floats  # shape (units, size): shares of all units
-    paint: Floats  # shape (size,): memory for a row of the paints' covariance
+    seen: Floats32
+    flipped: Floats32
+    share: Floats32
+    reach: Floats32  # shape (size,): what the distance from the unit takes off a smooth stain
+    noise: Floats32  # shape (size,)
+    units: Floats32  # shape (units, size): shares of all units
+    paint: Floats32  # shape (size,): memory for a row of the paints' covariance
 
 
 @step
@@ -280,9 +283,10 @@ def _look_around(
 ) -> Local:
     """Gather what is known of the pixels around a unit, so that what follows runs over neighbours in memory."""
     size, unit = around.pixels.size, around.unit
+    lists = np.empty((8, size), np.float32)
     local = Local(
-        np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size),
-        np.empty((by_unit.shape[0], size)), np.empty(size),
+        lists[0], lists[1], lists[2], lists[3], lists[4], lists[5], lists[6],
+        np.empty((by_unit.shape[0], size), np.float32), lists[7],
     )  # fmt: skip
     for i in range(size):
         p = around.pixels[i]
@@ -301,14 +305,14 @@ def _look_around(
 
 
 @routine
-def _set_paint(pattern: PlatePattern, shown: Ints, units: Floats, i: int, paint: Floats) -> None:
+def _set_paint(pattern: PlatePattern, shown: Ints, units: Floats32, i: int, paint: Floats32) -> None:
     """Set a row of the covariance that the units' own reflectances give, from pixel i on."""
     size = paint.size - i
     for k in range(size):
-        paint[np.uint64(i + k)] = 0.0
+        paint[np.uint64(i + k)] = np.float32(0.0)
     for other in shown:
         spread = pattern.dark_spread if pattern.dark[other] > 0.5 else pattern.white_spread
-        weight = spread * spread * units[other, i]
+        weight = np.float32(spread * spread) * units[other, i]
         for k in range(size):
             paint[np.uint64(i + k)] += weight * units[other, np.uint64(i + k)]
 
@@ -317,12 +321,12 @@ def _set_paint(pattern: PlatePattern, shown: Ints, units: Floats, i: int, paint:
 def _add_veil(variance: float, length_mm: float, local: Local, i: int) -> None:
     """Add what is left of a veil of glare to a row of the paints' covariance, from pixel i on."""
     x0, y0 = local.x_mm[i], local.y_mm[i]
-    by_length = 0.5 / (length_mm * length_mm)
+    by_length, scale = np.float32(0.5 / (length_mm * length_mm)), np.float32(variance)
     for k in range(local.x_mm.size - i):
         j = np.uint64(i + k)
         right = local.x_mm[j] - x0
         down = local.y_mm[j] - y0
-        local.paint[j] += variance * _exp_down((right * right + down * down) * by_length)
+        local.paint[j] += scale * _exp_down((right * right + down * down) * by_length)
 
 
 @routine
@@ -331,10 +335,10 @@ def _set_row(light: LightPrior, local: Local, own: float, i: int, read: Floats32
     x_mm, y_mm, seen, flipped = local.x_mm, local.y_mm, local.seen, local.flipped
     share, reach, paint = local.share, local.reach, local.paint
     x0, y0, seen0, flipped0, reach0 = x_mm[i], y_mm[i], seen[i], flipped[i], reach[i]
-    own0 = own * share[i]
-    variance, level_variance = light.spread * light.spread, light.level_variance
-    by_length = 1.0 / light.length_mm
-    by_stain = 0.5 / (STAIN_LENGTH_MM * STAIN_LENGTH_MM)
+    own0 = np.float32(own) * share[i]
+    variance, level_variance = np.float32(light.spread * light.spread), np.float32(light.level_variance)
+    by_length = np.float32(1.0 / light.length_mm)
+    by_stain = np.float32(0.5 / (STAIN_LENGTH_MM * STAIN_LENGTH_MM))
     for k in range(x_mm.size - i):
         j = np.uint64(i + k)
         right = x_mm[j] - x0
@@ -355,14 +359,14 @@ def _set_row(light: LightPrior, local: Local, own: float, i: int, read: Floats32
 
 @routine
 def _set_covered(
-    pattern: PlatePattern, blur_mm: float, unit: int, local: Local, spots: Floats, first: int, columns: Floats32
+    pattern: PlatePattern, blur_mm: float, unit: int, local: Local, spots: Floats32, first: int, columns: Floats32
 ) -> None:
     """Set the light that each white spot would send to each pixel, then that of what it hides, a column a spot."""
     count = spots.shape[1]
-    beside = np.empty(count)
-    on_unit = np.empty(count)
-    unit_albedo = 1.0 if pattern.dark[unit] > 0.5 else pattern.dark_albedo  # of the unit flipped
-    inner = pattern.inner_mm
+    beside = np.empty(count, np.float32)
+    on_unit = np.empty(count, np.float32)
+    unit_albedo = np.float32(1.0 if pattern.dark[unit] > 0.5 else pattern.dark_albedo)  # of the unit flipped
+    inner, by_blur, one = np.float32(pattern.inner_mm), np.float32(EDGE_SLOPE / blur_mm), np.float32(1.0)
     covered, hidden = np.uint64(first), np.uint64(first + count)
     for i in range(local.x_mm.size):
         own = local.share[i]
@@ -372,14 +376,14 @@ def _set_covered(
         nearest_x = min(max(x, -inner), inner)
         nearest_y = min(max(y, -inner), inner)
         others = local.flipped[i] - own * unit_albedo
-        _set_cover(spots, x, y, blur_mm, beside)
+        _set_cover(spots, x, y, by_blur, beside)
         if own > MIN_UNIT_SHARE and (nearest_x != x or nearest_y != y):
-            _set_cover(spots, nearest_x, nearest_y, blur_mm, on_unit)
+            _set_cover(spots, nearest_x, nearest_y, by_blur, on_unit)
         else:
             on_unit[:] = beside
         for spot in range(count):
             g = np.uint64(spot)
-            columns[i, covered + g] = (1.0 - own) * beside[g] + own * on_unit[g]
+            columns[i, covered + g] = (one - own) * beside[g] + own * on_unit[g]
             columns[i, hidden + g] = beside[g] * others + on_unit[g] * own * unit_albedo
 
 
@@ -391,15 +395,15 @@ def _spot_likelihood(spots: Spots, matrix: Floats32, first: int) -> float:
     so its light varies alike. From column `first` on: residual of the unit flipped, covered, hidden.
     """
     count = spots.shapes.shape[1]
-    sums = np.zeros((5, count))
+    sums = np.zeros((5, count), np.float32)
     square = 0.0
     for i in range(matrix.shape[0]):
-        residual = np.float64(matrix[i, first])
-        square += residual * residual
+        residual = matrix[i, first]
+        square += np.float64(residual) * residual
         for spot in range(count):
             k = np.uint64(spot)
-            covered = np.float64(matrix[i, np.uint64(first + 1) + k])
-            hidden = np.float64(matrix[i, np.uint64(first + 1 + count) + k])
+            covered = matrix[i, np.uint64(first + 1) + k]
+            hidden = matrix[i, np.uint64(first + 1 + count) + k]
             sums[0, k] += residual * covered
             sums[1, k] += residual * hidden
             sums[2, k] += covered * covered
@@ -408,7 +412,8 @@ def _spot_likelihood(spots: Spots, matrix: Floats32, first: int) -> float:
     top = -1e300
     total = 0.0
     for g in range(count):
-        by_cover, by_hidden, cover2, both, hidden2 = sums[0, g], sums[1, g], sums[2, g], sums[3, g], sums[4, g]
+        by_cover, by_hidden = np.float64(sums[0, g]), np.float64(sums[1, g])
+        cover2, both, hidden2 = np.float64(sums[2, g]), np.float64(sums[3, g]), np.float64(sums[4, g])
         for o in spots.opacities:
             for b in spots.paints:
                 added = o * o * (b * b * cover2 - 2.0 * b * both + hidden2) - 2.0 * o * (b * by_cover - by_hidden)

@@ -121,7 +121,7 @@ def test_the_likelihoods_are_those_of_normal_distributions(veil: float) -> None:
     noise = rng.uniform(1e-4, 4e-4, count)
     pattern = PlatePattern(dark, seen, albedo, WHITE_SPREAD, DARK_SPREAD, np.array([[15.0, 15.0]] * 2), 100.0, 5.0)
     prior = LightPrior(light, noise, spread, length_mm, level, veil, 80.0)
-    spots = Spots(np.array([[0, 0, 1, 0, 1, 1.0]]).T.copy(), np.array([0.5]), np.array([0.0]))
+    spots = Spots(np.array([[0, 0, 1, 0, 1, 1]], np.float32).T.copy(), np.array([0.5]), np.array([0.0]))
     found = np.empty((2, 5))
     set_unit_likelihoods(pixels, pattern, prior, spots, found)
     apart = np.linalg.norm(places[:, None] - places[None], axis=2)
