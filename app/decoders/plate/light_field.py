@@ -393,33 +393,66 @@ def veil_log_odds(values: Array, covariance: Array, haze: Veil, patterns: list[A
         Units along a side.
     """
     order = unit_index(n).reshape(-1)
-    even = [_log_likelihood(values, covariance, haze, dark, s, None, n) for dark in patterns for s in LIGHT_SPREADS]
-    veil = _correlations(n).veil[order]
-    veiled = [
-        _log_likelihood(values, covariance, haze, dark, s, v**2 * veil, n)
-        for dark in patterns
-        for s in LIGHT_SPREADS[:1]
-        for v in VEIL_SPREADS
-    ]
-    even_mean = np.logaddexp.reduce(even) - math.log(len(LIGHT_SPREADS))
-    veiled_mean = np.logaddexp.reduce(veiled) - math.log(len(VEIL_SPREADS))
+    even = [(light, 0.0) for light in LIGHT_SPREADS]
+    veiled = [(LIGHT_SPREADS[0], veil) for veil in VEIL_SPREADS]
+    found = _log_likelihoods(
+        _UnitsLight(values, covariance, _correlations(n).light, _correlations(n).veil[order]),
+        float(haze.light[0, 0]), haze.level, np.array(patterns, bool), np.array(even + veiled),
+    )  # fmt: skip
+    even_mean = np.logaddexp.reduce(found[:, : len(even)], axis=None) - math.log(len(even))
+    veiled_mean = np.logaddexp.reduce(found[:, len(even) :], axis=None) - math.log(len(veiled))
     return float(veiled_mean - even_mean) + math.log(VEIL_PRIOR / (1 - VEIL_PRIOR))
 
 
-def _log_likelihood(
-    values: Array, covariance: Array, haze: Veil, dark: Array, light_spread: float, veil: Array | None, n: int
-) -> float:
-    """Of the units' light under a pattern, without the constant."""
-    seen, scale = np.where(dark, DARK_SHARE, 1.0), haze.level
-    light = light_spread**2 * _correlations(n).light + LEVEL_SPREAD**2
-    total = light * np.outer(seen, seen) + HAZE_SPREAD**2 + np.diag(np.where(dark, DARK_WEAR, LIGHT_WEAR) ** 2)
-    if veil is not None:
-        total = total + veil
-    total = scale**2 * total + covariance
-    residual = values - float(haze.light[0, 0]) - scale * seen
-    factor = np.linalg.cholesky(total)
-    half = np.linalg.solve(factor, residual)
-    return float(-0.5 * half @ half - np.log(np.diag(factor)).sum())
+class _UnitsLight(NamedTuple):
+    """Light of the units, and what it varies by."""
+
+    values: Floats  # shape (units,)
+    covariance: Floats  # shape (units, units): of their errors
+    light: Floats  # shape (units, units): correlation of the light
+    veil: Floats  # shape (units, units): correlation of a veil
+
+
+@kernel
+def _log_likelihoods(
+    units: _UnitsLight, haze: float, level: float, patterns: npt.NDArray[np.bool_], spreads: Floats
+) -> Floats:
+    """Of the units' light under each pattern of dark units, shape (patterns, spreads), without the constant.
+
+    Parameters
+    ----------
+    haze, level : float
+        Light that is the same everywhere, and that of light units above it.
+    patterns : ndarray of bool, shape (patterns, units)
+    spreads : ndarray, shape (S, 2)
+        Standard deviations of the light, relative, and of the veil over the level.
+    """
+    size = units.values.size
+    total = np.empty((size, size))
+    residual = np.empty(size)
+    found = np.empty((patterns.shape[0], spreads.shape[0]))
+    level2 = level * level
+    for p in range(patterns.shape[0]):
+        dark = patterns[p]
+        for s in range(spreads.shape[0]):
+            light2, veil2 = spreads[s, 0] ** 2, spreads[s, 1] ** 2
+            for i in range(size):
+                seen = DARK_SHARE if dark[i] else 1.0
+                residual[i] = units.values[i] - haze - level * seen
+                for j in range(i + 1):
+                    both = seen * (DARK_SHARE if dark[j] else 1.0)
+                    varies = (light2 * units.light[i, j] + LEVEL_SPREAD**2) * both + HAZE_SPREAD**2
+                    total[i, j] = level2 * (varies + veil2 * units.veil[i, j]) + units.covariance[i, j]
+                wear = DARK_WEAR if dark[i] else LIGHT_WEAR
+                total[i, i] += level2 * wear * wear
+            factor = factorize(total)
+            found[p, s] = -np.inf
+            if factor.shape[0] == size:
+                half = substitute(factor, residual)
+                found[p, s] = -0.5 * np.dot(half, half)
+                for i in range(size):
+                    found[p, s] -= math.log(factor[i, i])
+    return found
 
 
 class _Correlations(NamedTuple):
