@@ -76,7 +76,6 @@ PROVEN_RECALL = 0.95
 """[1] least share of the magnets of a kind that must be read at a distance that counts as proven. Source: by hand;
 METRO calls 30 cm reliable with 0.87 and 0.93 (section 7.3)."""
 RECALL_SOURCE = "app/planning/data/magnet_recall.csv (python -m benchmarks.magnets recall)"
-_BEYOND_M = 0.05  # [m] behind the last measured distance, in which the log-odds fall to those of 1 in 20
 
 
 class MagnetRecall(NamedTuple):
@@ -98,14 +97,12 @@ class MagnetRecall(NamedTuple):
 
 @lru_cache(maxsize=2)
 def magnet_recall(orientation: Orientation) -> MagnetRecall:
-    """The measured table of a kind of magnet; nothing is proven behind its last row."""
+    """The measured table of a kind of magnet."""
     rows = read_figures("magnet_recall.csv")
     read = np.array([float(row["upright" if orientation is Orientation.UP else "lying"]) for row in rows])
     count = np.array([float(row["magnets"]) / 2 for row in rows])
-    log_odds = scipy.special.logit((read * count + 0.5) / (count + 1))  # the median of Jeffreys' posterior, nearly
-    distance_m = np.array([float(row["distance_m"]) for row in rows])
-    end = (distance_m[-1] + _BEYOND_M, scipy.special.logit(0.05))
-    return MagnetRecall(np.append(distance_m, end[0]), np.append(log_odds, end[1]))
+    log_odds = scipy.special.logit((read * count + 0.5) / (count + 1))  # Jeffreys' prior: none is sure
+    return MagnetRecall(np.array([float(row["distance_m"]) for row in rows]), np.asarray(log_odds))
 
 
 # === What is checked before a layout is installed: each check with its figure, limit and where the limit comes from.
