@@ -559,7 +559,7 @@ def _alone(plan: Plan, plates: Sequence[PlannedMarker], rules: PlateRules) -> Pl
         sentence += f": {NO_CHECK_TEXT}; choose plates.scheme: {PlateScheme.POSITION_ROBUST} or {PlateScheme.ID}, or "
         sentence += "vehicles.read_alone: false if all vehicles know the registered plates"
     return compare(
-        "plate-check", count, "<=", 0, "plates", "docs/plates.md", sentence, plates[0] if count else None,
+        "plate-check", count, "<=", 0, "plates", "docs/artwork.md", sentence, plates[0] if count else None,
         missed=Verdict.WARN,
     )  # fmt: skip
 
