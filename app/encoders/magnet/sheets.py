@@ -7,11 +7,10 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from itertools import pairwise
-from typing import Any
 
 import orjson
 
-from app.encoders.magnet.layout import DrillingSheet, Hole, SheetFormat
+from app.encoders.magnet.layout import CostRow, DrillingSheet, Hole, SheetFormat
 from app.encoders.pdf import POINTS_PER_MM, Canvas, EmbeddedFont, PdfFile
 from app.formats.text import TableWriter
 from app.markers.magnet import InformationTag, Orientation, Polarity
@@ -446,24 +445,23 @@ def _draw_checks(paper: _Paper, sheet: DrillingSheet) -> None:
 
 def _draw_bill(paper: _Paper, sheet: DrillingSheet) -> None:
     bill = sheet.bill
-    rows: Sequence[tuple[str, Any]] = [
-        *(("", row) for row in bill.materials),
+    rows = [
+        *(("", row) for row in (*bill.materials, *bill.without_price)),
         *(("instead: ", row) for row in bill.alternatives),
     ]
-    paper.need(8.0 + 4.6 * (len(rows) + len(bill.without_price)))
+    paper.need(8.0 + 4.6 * len(rows))
     paper.heading("Materials, without labour")
     for prefix, row in rows:
-        cost = row.cost
-        paper.text(_LEFT_MM, paper.y_mm, f"{prefix}{cost.item}", 7.5)
-        paper.text(100, paper.y_mm, f"{row.quantity:g} {cost.unit}", 7.5, anchor="end")
-        usd = f"{row.low_usd:.2f}" if row.low_usd == row.high_usd else f"{row.low_usd:.2f} - {row.high_usd:.2f}"
-        paper.text(150, paper.y_mm, f"{usd} USD", 7.5, anchor="end")
-        paper.text(156, paper.y_mm, cost.source, 7, colour=_GREY)
-        paper.y_mm -= 4.6
-    for unpriced in bill.without_price:
-        paper.text(_LEFT_MM, paper.y_mm, unpriced.item, 7.5)
-        paper.text(100, paper.y_mm, f"{unpriced.quantity:g} {unpriced.unit}", 7.5, anchor="end")
-        paper.text(150, paper.y_mm, "no published price", 7.5, anchor="end")
+        if isinstance(row, CostRow):
+            item, unit, source = row.cost.item, row.cost.unit, row.cost.source
+            usd = f"{row.low_usd:.2f}" if row.low_usd == row.high_usd else f"{row.low_usd:.2f} - {row.high_usd:.2f}"
+            price = f"{usd} USD"
+        else:
+            item, unit, source, price = row.item, row.unit, "", "no published price"
+        paper.text(_LEFT_MM, paper.y_mm, f"{prefix}{item}", 7.5)
+        paper.text(100, paper.y_mm, f"{row.quantity:g} {unit}", 7.5, anchor="end")
+        paper.text(150, paper.y_mm, price, 7.5, anchor="end")
+        paper.text(156, paper.y_mm, source, 7, colour=_GREY)
         paper.y_mm -= 4.6
 
 

@@ -311,7 +311,7 @@ def _line_spacing(plan: Plan, lines: list[PlannedMarker]) -> Iterator[PlanFindin
     low, high = circumference_m
     sentence = f"lines whose magnets are half, one or two turns of a wheel of {low:g} to {high:g} m apart"
     if repeating:
-        cure = turn_cure(circumference_m).replace("a spacing", "lines.max_spacing_m")
+        cure = turn_cure(circumference_m).replace("choose", "choose lines.max_spacing_m of")
         sentence += f", as the wheel's own field: {repeating[0][0]:.2f} m; {cure}"
     yield compare(
         "wheel-turns", len(repeating), "<=", 0, "lines", "docs/benchmarks.md: lines of magnets", sentence,
