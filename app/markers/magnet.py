@@ -134,21 +134,21 @@ class Installation:
     ] = None
 
     def __post_init__(self) -> None:
-        on_surface = self.mounting == Mounting.SURFACE
-        other = ("hole_diameter_mm", "hole_depth_mm") if on_surface else ("shell_height_mm",)
+        object.__setattr__(self, "mounting", Mounting(self.mounting))
+        other = ("hole_diameter_mm", "hole_depth_mm") if self.on_surface else ("shell_height_mm",)
         for name in other:
             if getattr(self, name) is not None:
                 raise InvalidParameter(
                     f"{name} means nothing for magnets with the mounting {self.mounting}",
                     field=name,
                     limit="hole_diameter_mm and hole_depth_mm: hole; shell_height_mm: surface",
-                    cure=f"leave {name} out, or choose the mounting {'hole' if on_surface else 'surface'}",
+                    cure=f"leave {name} out, or choose the mounting {'hole' if self.on_surface else 'surface'}",
                 )
 
     @property
     def on_surface(self) -> bool:
         """Whether nothing is drilled."""
-        return self.mounting == Mounting.SURFACE
+        return self.mounting is Mounting.SURFACE
 
     @property
     def depth_m(self) -> float:

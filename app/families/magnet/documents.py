@@ -184,7 +184,8 @@ def _hole_document(hole: JsonObject) -> HoleDocument:
     properties = {
         name: value + 0.0 if isinstance(value, float) else value for name, value in hole["properties"].items()
     }
-    del properties["layout"], properties["code"], properties["hole"]
+    for name in ("layout", "code", "hole", "depth_m"):
+        del properties[name]
     return cast(HoleDocument, {"number": hole["id"], "lon_deg": lon_deg, "lat_deg": lat_deg, **properties})
 
 
