@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import orjson
 
-from app.encoders.magnet.layout import CostRow, DrillingSheet, Hole, SheetFormat
+from app.encoders.magnet.layout import CostRow, DrillingSheet, Hole, SheetFormat, UnpricedRow
 from app.encoders.pdf import POINTS_PER_MM, Canvas, EmbeddedFont, PdfFile
 from app.formats.text import TableWriter
 from app.markers.magnet import InformationTag, Orientation, Polarity
@@ -445,7 +445,7 @@ def _draw_checks(paper: _Paper, sheet: DrillingSheet) -> None:
 
 def _draw_bill(paper: _Paper, sheet: DrillingSheet) -> None:
     bill = sheet.bill
-    rows = [
+    rows: list[tuple[str, CostRow | UnpricedRow]] = [
         *(("", row) for row in (*bill.materials, *bill.without_price)),
         *(("instead: ", row) for row in bill.alternatives),
     ]

@@ -247,7 +247,8 @@ _FORMER_NAMES: Final = {"design_speed_mps": "design_speed_m_s", "deceleration_mp
 def site_of(spec: MagnetSpec) -> Site:
     """The site of a stored layout."""
     stored = {_FORMER_NAMES.get(name, name): value for name, value in spec["site"].items()}
-    return Site(**{name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()})
+    pairs = {name: tuple(stored[name]) for name in ("vehicles", "wheel_circumference_m") if name in stored}
+    return Site(**{**stored, **pairs})
 
 
 def sheet_of(name: str, spec: MagnetSpec) -> DrillingSheet:

@@ -378,7 +378,7 @@ def _resolution(design: TagDesign, reading: CodebookRules, at: str) -> PlanFindi
     A longer tag with longer segments is for higher speeds, at which the bar has fewer samples of each magnet, and for
     larger distances (METRO section 10).
     """
-    covariance = covariance_of(placements_of(design) * design.segment_m, reading.conditions)
+    covariance = covariance_of(placements_of(design).astype(np.float64) * design.segment_m, reading.conditions)
     std_m = design.length_m * math.sqrt(float(np.diagonal(covariance, axis1=1, axis2=2).max()))
     needed_m = separation_for(reading.confusion) * std_m
     sentence = f"segments of tags, against the least move of a magnet that is read as another code {at}"

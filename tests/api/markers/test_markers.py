@@ -78,7 +78,7 @@ def test_a_scheme_without_a_check_has_a_warning(client: httpx.Client, place: Pla
     assert client.get(f"/v1/markers/{marker['id']}").json()["code_warnings"] == [warning]
     for code in (ROBUST, {"scheme": "id"}, {"scheme": "position-check"}):
         assert created(client, "/v1/markers", position=place(), code=code)["code_warnings"] == []
-    bulk = {"items": [{"family": "plate", "position": place(), "code": PLAIN}], "dry_run": True}
+    bulk = {"items": [{"create": {"position": place(), "code": PLAIN}}], "dry_run": True}
     [item] = client.post("/v1/markers/bulk", json=bulk).json()["results"]
     assert item["warnings"] == [warning]
 
