@@ -446,7 +446,8 @@ def _draw_checks(paper: _Paper, sheet: DrillingSheet) -> None:
 def _draw_bill(paper: _Paper, sheet: DrillingSheet) -> None:
     bill = sheet.bill
     rows: list[tuple[str, CostRow | UnpricedRow]] = [
-        *(("", row) for row in (*bill.materials, *bill.without_price)),
+        *(("", row) for row in bill.materials),
+        *(("", unpriced) for unpriced in bill.without_price),
         *(("instead: ", row) for row in bill.alternatives),
     ]
     paper.need(8.0 + 4.6 * len(rows))

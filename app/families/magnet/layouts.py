@@ -247,8 +247,9 @@ _FORMER_NAMES: Final = {"design_speed_mps": "design_speed_m_s", "deceleration_mp
 def site_of(spec: MagnetSpec) -> Site:
     """The site of a stored layout."""
     stored = {_FORMER_NAMES.get(name, name): value for name, value in spec["site"].items()}
-    pairs = {name: tuple(stored[name]) for name in ("vehicles", "wheel_circumference_m") if name in stored}
-    return Site(**{**stored, **pairs})
+    for name in {"vehicles", "wheel_circumference_m"} & set(stored):
+        stored[name] = tuple(stored[name])
+    return Site(**stored)
 
 
 def sheet_of(name: str, spec: MagnetSpec) -> DrillingSheet:
