@@ -74,9 +74,10 @@ class PlateModel:
 class MagnetModel:
     """Read rate of a tag or of a line's magnet: what bends and neighbours leave, times that of magnets by distance."""
 
-    # `straight`, `per_curvature`: log-odds on a straight road near to the magnets, and by how much they change with
-    # curvature. [1, m]
+    # `straight`, `per_metre`, `per_curvature`: log-odds on a straight road 0.16 m above the magnets, and by how much
+    # they change with the distance, as neighbours merge, and with curvature. [1, 1/m, m]
     straight: float
+    per_metre: float
     per_curvature: float
     # `fix_share`, `fix_rms_m`: share of read tags that fix the position, and its error with an exact survey,
     # horizontal. [1, m]
@@ -96,7 +97,9 @@ class MagnetModel:
             Of the tag, each of which must be read.
         """
         bend = np.abs(np.asarray(curvature_per_m, dtype=np.float64))
-        near = np.asarray(scipy.special.expit(self.straight + self.per_curvature * bend))
+        near = np.asarray(
+            scipy.special.expit(self.straight + self.per_metre * (distance_m - 0.16) + self.per_curvature * bend)
+        )
         return near * magnet_recall(orientation).share_at(distance_m) ** magnets
 
 

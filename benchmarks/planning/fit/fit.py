@@ -83,36 +83,40 @@ def _rounded_plates(model: PlateModel, fix_rms_m: float, exposures_s: tuple[floa
 def fit_tags(seen: Sequence[TagPassSeen]) -> MagnetModel:
     """What tags are read beside the share of their magnets that is read at their distance."""
     recall = magnet_recall(Orientation.FORWARD)
-    magnets = np.array([recall.share_at(Installation().distance_m(one.clearance_m)) ** one.magnets for one in seen])
+    distance = np.array([Installation().distance_m(one.clearance_m) for one in seen])
+    magnets = np.array([recall.share_at(d) ** one.magnets for d, one in zip(distance.tolist(), seen, strict=True)])
     bend, read = (np.array([getattr(one, name) for one in seen], float) for name in ("curvature_per_m", "read"))
     fixes = [one.fix_m for one in seen if one.fix_m is not None]
     rms = math.sqrt(sum(fix**2 for fix in fixes) / len(fixes))
-    values = _logistic(magnets, bend, read, np.ones(len(seen)))
+    values = _logistic(magnets, distance, bend, read, np.ones(len(seen)))
     return MagnetModel(*values, round(len(fixes) / float(read.sum()), 4), round(rms, 4))
 
 
 def fit_lines(seen: Sequence[LineSeen]) -> MagnetModel:
     """The same of the magnets of lines under the bar."""
     recall = magnet_recall(Orientation.UP)
-    magnets = np.array([recall.share_at(Installation().distance_m(one.clearance_m)) for one in seen])
+    distance = np.array([Installation().distance_m(one.clearance_m) for one in seen])
+    magnets = np.array([recall.share_at(d) for d in distance.tolist()])
     bend, read, passed = (
         np.array([getattr(one, name) for one in seen], float) for name in ("curvature_per_m", "read", "magnets")
     )
-    return MagnetModel(*_logistic(magnets, bend, read, passed))
+    return MagnetModel(*_logistic(magnets, distance, bend, read, passed))
 
 
-def _logistic(magnets: Floats, bend: Floats, read: Floats, passed: Floats) -> tuple[float, float]:
-    """Log-odds and their change with curvature, of what is read times the share of the magnets that is read."""
-    prior = np.array([3.0, 100.0])  # source: by hand, standard deviations about 4 and 0
+def _logistic(
+    magnets: Floats, distance: Floats, bend: Floats, read: Floats, passed: Floats
+) -> tuple[float, float, float]:
+    """Log-odds and their change with distance and curvature, of what is read times the share of the magnets read."""
+    prior = np.array([3.0, 20.0, 100.0])  # source: by hand, standard deviations about 4, 0 and 0
 
     def loss(t: Floats) -> float:
-        rate = np.clip(magnets * expit(t[0] + t[1] * bend), _TINY, 1 - _TINY)
+        rate = np.clip(magnets * expit(t[0] + t[1] * (distance - 0.16) + t[2] * bend), _TINY, 1 - _TINY)
         seen = read * np.log(rate) + (passed - read) * np.log(1 - rate)
-        return float((((t - (4.0, 0.0)) / prior) ** 2).sum()) / 2 - float(seen.sum())
+        return float((((t - (4.0, 0.0, 0.0)) / prior) ** 2).sum()) / 2 - float(seen.sum())
 
-    found = minimize(loss, np.array([4.0, 0.0]), method="Nelder-Mead", options={"maxfev": 2000})
-    straight, bent = (round(float(value), 4) for value in found.x)
-    return straight, min(bent, 0.0)  # bends do not help
+    found = minimize(loss, np.array([4.0, 0.0, 0.0]), method="Nelder-Mead", options={"maxfev": 2000})
+    straight, slope, bent = (round(float(value), 4) for value in found.x)
+    return straight, min(slope, 0.0), min(bent, 0.0)  # neither distance nor bends help
 
 
 def fit_path(seen: Sequence[PathSeen]) -> PathModel:

@@ -186,7 +186,7 @@ def magnets_on(speed_kmh: float = 50.0, **rules: object) -> Plan:
 
 def test_the_depth_of_holes_counts_in_checks_and_predictions() -> None:
     flush, deep = (
-        magnets_on(installation={"hole_depth_mm": depth}, predictions={"clearance_m": 0.3}) for depth in (30, 300)
+        magnets_on(installation={"hole_depth_mm": depth}, predictions={"clearance_m": 0.25}) for depth in (30, 300)
     )
     for name in ("clearance utility", "clearance utility line"):
         near, far = finding(flush, name), finding(deep, name)
