@@ -43,11 +43,11 @@ from app.formats.traces.parts import open_parts
 from app.geodesy import LocalizationGrade, decimal_year, move_to_epoch
 from app.lanes.types import NO_LINE, Lane, LaneMarkers, LaneRules, PacketStrengths
 from app.markers.cerpm import MAX_INVALID_TAGS_PER_LOG, LaneSide, SpeedLimit, SpeedUnit, derive_marker_key
-from app.markers.magnet import InformationTag, parse_tag
-from app.markers.magnet_design import INFORMATION_TAG, MagnetSpec, meaning_of
+from app.markers.magnet import HALF_HEIGHT_M, InformationTag, parse_tag
+from app.markers.magnet_design import INFORMATION_TAG, MagnetSpec, installation_of, meaning_of
 from app.markers.reading import MarkerRow, horizontal_rmse_m, marker_at, row_warnings
 from app.radio.settings import RadioSettings
-from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+from app.sensors.magnetometer_bar import MAX_CLEARANCE_M, MIN_CLEARANCE_M, MagnetometerBar, MagnetTrace
 from app.sensors.pose_track import PoseTrack, ReceivedPacket
 
 # === Recordings of magnetometers: the information tags that are registered nearby, and what is found.
@@ -55,6 +55,7 @@ from app.sensors.pose_track import PoseTrack, ReceivedPacket
 
 MAX_MAGNET_ROWS = 4 * MAX_TAGS
 """Magnet markers among which tags are looked for."""
+_SAME_DEPTH_M = 0.03  # [m] of depths that count as one; source: as the decoder's error of a declared clearance
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +64,19 @@ class NearbyTags:
 
     tags: tuple[RegisteredTag, ...] = ()
     complete: bool = True
+    # [m] of all magnets nearby below the road, lines too; on the road where there are none, None where they differ
+    depth_m: float | None = -HALF_HEIGHT_M
 
     @classmethod
     def of(cls, rows: Sequence[MarkerRow], epoch: float) -> NearbyTags:
         """Those among the magnet markers nearby, at most `MAX_MAGNET_ROWS`, where they are at an epoch."""
-        tags = [row for row in rows if row.scheme == INFORMATION_TAG and row.status != "retired"]
+        rows = [row for row in rows if row.status != "retired"]
+        tags = [row for row in rows if row.scheme == INFORMATION_TAG]
         complete = len(tags) <= MAX_TAGS and len(rows) < MAX_MAGNET_ROWS
-        return cls(tuple(registered_tag(row, epoch) for row in tags[:MAX_TAGS]), complete)
+        depths_m = [installation_of(row.spec).depth_m for row in rows] or [-HALF_HEIGHT_M]
+        alike = max(depths_m) - min(depths_m) <= _SAME_DEPTH_M
+        depth_m = float(np.median(depths_m)) if alike else None
+        return cls(tuple(registered_tag(row, epoch) for row in tags[:MAX_TAGS]), complete, depth_m)
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -93,12 +100,23 @@ def registered_tag(stored: MarkerRow, epoch: float) -> RegisteredTag:
     return RegisteredTag(
         row.id, row.status, tag, row.lon_deg, row.lat_deg, row.height_m, row.heading_deg,
         lane_lon_deg, lane_lat_deg, horizontal_rmse_m(row), row.localization_grade,
-        tuple(row_warnings(row, "tag")), meaning_of(spec),
+        tuple(row_warnings(row, "tag")), meaning_of(spec), installation_of(spec).depth_m,
     )  # fmt: skip
 
 
+def bar_above(bar: MagnetometerBar, depth_m: float | None) -> MagnetometerBar:
+    """A bar whose declared clearance is that above the magnets, as decoders take it; unknown where depths differ."""
+    if bar.clearance_m is None or depth_m is None:
+        return replace(bar, clearance_m=None)
+    return replace(bar, clearance_m=min(max(bar.clearance_m + depth_m, MIN_CLEARANCE_M), MAX_CLEARANCE_M))
+
+
 def find_magnets(
-    trace: MagnetTrace, declared: DeclaredTrace, tags: tuple[str, ...], formats: tuple[TagFormat, ...]
+    trace: MagnetTrace,
+    declared: DeclaredTrace,
+    tags: tuple[str, ...],
+    formats: tuple[TagFormat, ...],
+    depth_m: float | None = -HALF_HEIGHT_M,
 ) -> tuple[list[Finding], str]:
     """Findings in a recording, in the order of their completion, and the version of the decoder.
 
@@ -108,6 +126,8 @@ def find_magnets(
         Texts of the information tags that are registered nearby.
     formats : tuple of TagFormat
         Used where there are none, unless the upload declares some.
+    depth_m : float, optional
+        Of the magnets that are registered nearby, below the road; None where they differ. [m]
     """
     if declared.method == "metro":
         from app.decoders.magnet import metro  # not loaded before: scipy.signal takes most of a second
@@ -117,7 +137,7 @@ def find_magnets(
 
     known = [tag for text in tags if isinstance(tag := parse_tag(text), InformationTag)]
     candidates = TagCandidates(tags=known) if known else TagCandidates(formats=declared.tag_formats or formats)
-    return decode_trace(trace, declared.sensors, candidates=candidates), VERSION
+    return decode_trace(trace, bar_above(declared.sensors, depth_m), candidates=candidates), VERSION
 
 
 # === Files of a drive past CERPMs.

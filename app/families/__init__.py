@@ -43,7 +43,7 @@ def rows_of_plan(plan: Plan, now: datetime) -> dict[int, MarkerRow]:
     The row of a line of magnets has the number of its first magnet.
     """
     radio = plan.radio or radio_settings(plan) or RadioSettings()
-    commitment = Commitment("", plan.alignment, MarkerRules(), now, radio=radio)
+    commitment = Commitment("", plan.alignment, MarkerRules(), now, radio=radio, installation=plan.rules.installation)
     same = {"status": PLANNED, "version": 1, "created_at": now, "updated_at": now}
     rows = {}
     for family in FAMILIES:

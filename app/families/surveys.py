@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Texts
+from app.markers.magnet import Installation
 from app.markers.plate import Digits
 from app.markers.reading import MarkerRow
 from app.planning.alignment import Alignment
@@ -79,6 +80,7 @@ class Commitment:
     now: datetime
     codebook_id: str | None = None  # of the tags
     radio: RadioSettings = field(default_factory=RadioSettings)  # of the CERPMs
+    installation: Installation = field(default_factory=Installation)  # of the magnets
     roads: Mapping[str, str] = field(default_factory=dict)  # names in the registry of roads of the alignment
 
     def on_road(self, marker: PlannedMarker) -> ColumnValues:

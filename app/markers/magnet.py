@@ -17,8 +17,12 @@ from dataclasses import dataclass
 from decimal import Decimal
 from enum import IntEnum, StrEnum
 from itertools import pairwise
+from typing import Annotated
+
+from pydantic import Field, with_config
 
 from app.errors import CodeMismatch, InvalidParameter
+from app.inputs import INPUT, Number
 
 MAGNETS = (2, 7)
 """Smallest and largest number of magnets of an information tag. Source: METRO section 4.2 (two reference nodes) and
@@ -38,6 +42,12 @@ MOMENT_AM2 = 2.47
 Source: remanence times volume over mu0."""
 FIELD_UT_M3 = 0.1
 """mu0 / (4 pi), the field of a dipole of 1 A m2 at 1 m across its axis. [uT m3 / (A m2)] Source: SI."""
+
+HALF_HEIGHT_M = 0.005
+"""From the bottom of a magnet to its centre. [m] Source: half of METRO's 9.5 mm (section 6.2), and the glue."""
+SHELL_HEIGHT_MM = 15.0
+"""Height of a shell on the road, where none is stated. [mm] Source: by hand, the magnet's 9.5 mm and 5 mm of shell;
+METRO calls its shell thin (section 8.2) and gives no height."""
 
 _TICKS_PER_M = 10_000
 """Lengths are whole tenths of a millimetre. Exact to count with and fine enough for inches."""
@@ -85,6 +95,87 @@ class LineStyle(StrEnum):
 
     SOLID = "solid"
     DASHED = "dashed"
+
+
+class Mounting(StrEnum):
+    """How magnets are fixed: in drilled holes, or in shells that are glued onto the road (METRO section 8.2)."""
+
+    HOLE = "hole"
+    SURFACE = "surface"
+
+
+@with_config(INPUT)
+@dataclass(frozen=True, slots=True)
+class Installation:
+    """How the magnets of a layout are fixed in or on the road, and so how deep they lie.
+
+    Raises
+    ------
+    InvalidParameter
+        A size does not belong to the mounting.
+    """
+
+    mounting: Annotated[
+        Mounting, Field(description="`hole`: drilled; `surface`: in shells that are glued onto the road.")
+    ] = Mounting.HOLE
+    hole_diameter_mm: Annotated[
+        Number | None,
+        Field(ge=22.0, le=200.0, description="A bare METRO magnet of 15 x 15 x 9.5 mm needs at least 22 mm."),
+    ] = None
+    hole_depth_mm: Annotated[
+        Number | None,
+        Field(
+            ge=10.0, le=300.0, description="From the road's surface to the bottom of the hole; adds to the clearance."
+        ),
+    ] = None
+    shell_height_mm: Annotated[
+        Number | None,
+        Field(ge=10.0, le=50.0, description=f"Of a shell above the road; without, {SHELL_HEIGHT_MM:g} mm."),
+    ] = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mounting", Mounting(self.mounting))
+        other = ("hole_diameter_mm", "hole_depth_mm") if self.on_surface else ("shell_height_mm",)
+        for name in other:
+            if getattr(self, name) is not None:
+                raise InvalidParameter(
+                    f"{name} means nothing for magnets with the mounting {self.mounting}",
+                    field=name,
+                    limit="hole_diameter_mm and hole_depth_mm: hole; shell_height_mm: surface",
+                    cure=f"leave {name} out, or choose the mounting {'hole' if self.on_surface else 'surface'}",
+                )
+
+    @property
+    def on_surface(self) -> bool:
+        """Whether nothing is drilled."""
+        return self.mounting is Mounting.SURFACE
+
+    @property
+    def depth_m(self) -> float:
+        """Depth of a magnet's centre below the road, negative above it. [m]
+
+        A magnet stands on the bottom of its hole. Where the hole's depth is not stated, it counts as standing on the
+        road.
+        """
+        return (self.hole_depth_mm or 0.0) / 1000 - HALF_HEIGHT_M
+
+    @property
+    def height_mm(self) -> float:
+        """How far the magnets stand out of the road. [mm]"""
+        return (self.shell_height_mm or SHELL_HEIGHT_MM) if self.on_surface else 0.0
+
+    def distance_m(self, clearance_m: float) -> float:
+        """Distance from sensors at a clearance above the road down to the centre of a magnet. [m]"""
+        return clearance_m + self.depth_m
+
+    @property
+    def text(self) -> str:
+        """For people; empty where nothing is stated."""
+        if self.on_surface:
+            return f"on the surface, in shells {self.height_mm:g} mm high"
+        sizes = (("diameter", self.hole_diameter_mm), ("depth", self.hole_depth_mm))
+        found = ", ".join(f"{name} {size:g} mm" for name, size in sizes if size is not None)
+        return f"holes: {found}" if found else ""
 
 
 @dataclass(frozen=True, slots=True)

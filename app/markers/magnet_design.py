@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import product
 from math import comb
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, NotRequired
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from app.markers.magnet import (
     MIN_GAP_M,
     MOMENT_AM2,
     InformationTag,
+    Installation,
     Polarity,
     check_magnet_count,
     parse_tag,
@@ -259,7 +260,7 @@ class ReadingConditions:
     """Conditions under which a code must be read: the fastest and highest vehicle, its odometer and its decoder."""
 
     speed_m_s: float = 13.4
-    clearance_m: float = 0.30  # [m] of the sensors above the magnets
+    clearance_m: float = 0.30  # [m] of the sensors above the magnets: their depth adds to the vehicle's clearance
     odometer: OdometerError = field(default_factory=OdometerError)
     model: MagnetErrorModel = field(default_factory=MagnetErrorModel)
 
@@ -663,6 +664,12 @@ class MagnetSpec(TypedDict):
     place: dict[str, float | None]  # of `TagPlace` or `LinePlace`
     site: JsonObject  # of `Site`
     neighbours: list[StoredNeighbour]
+    installation: NotRequired[JsonObject]  # of `Installation`; markers of earlier releases have none
+
+
+def installation_of(spec: MagnetSpec) -> Installation:
+    """How the magnets are fixed."""
+    return Installation(**(spec.get("installation") or {}))
 
 
 def meaning_of(spec: MagnetSpec) -> Meaning | None:

@@ -144,9 +144,18 @@ class PlateScheme(StrEnum):
         return self in (PlateScheme.POSITION_ROBUST, PlateScheme.ID)
 
     @property
+    def has_check(self) -> bool:
+        """Whether a plate that is read wrongly can be noticed without the registry."""
+        return self is not PlateScheme.POSITION
+
+    @property
     def sizes(self) -> tuple[int, ...]:
         """Units along a side for which the scheme exists."""
         return (10, 12) if self is PlateScheme.POSITION_ROBUST else SIZES
+
+
+NO_CHECK_TEXT = "any twelve digits are a plate, and a wrong one is not noticed"
+"""Why plain positions are not for vehicles that read alone. Source: PolyU section II-B, on 8 x 8 units."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What is checked before a layout is drilled, with figures, limits and their sources; costs and drilling sheet."""
+"""What is checked before a layout is installed, with figures, limits and their sources; costs and the crew's sheet."""
 
 from __future__ import annotations
 
@@ -8,19 +8,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import scipy
 from pydantic import Field, with_config
 
-from app.encoders.magnet.layout import PAINT, Bill, CostRow, DrillingSheet, MagnetLayout, UnitCost
+from app.encoders.magnet.layout import PAINT, Bill, CostRow, DrillingSheet, MagnetLayout, UnitCost, UnpricedRow
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.inputs import INPUT, Number, Text
-from app.markers.magnet import MAX_LINE_SPACING_M, MIN_GAP_M, InformationTag, LineTag, Orientation
+from app.markers.magnet import (
+    MAX_LINE_SPACING_M,
+    MIN_GAP_M,
+    InformationTag,
+    Installation,
+    LineTag,
+    Orientation,
+)
 from app.markers.magnet_design import check_name
 from app.markers.reading import Check
+from app.values import Floats
 
 # === Tables of figures that the papers give.
 
@@ -34,7 +42,9 @@ def read_figures(name: str) -> list[dict[str, str]]:
 # === Bill of materials of a layout, compared with what else could mark the road.
 
 
-_MAGNET = "magnet with shell"
+_IN_HOLE, _ON_SURFACE = ("magnet with shell",), ("magnet", "protective shell")
+ADHESIVE = "bed of epoxy adhesive"
+"""What holds a shell on the road (METRO section 8.2); there is no published price."""
 _RFID = "rugged RFID tag"
 
 
@@ -50,18 +60,55 @@ def unit_costs() -> dict[str, UnitCost]:
 
 def bill_of_materials(layout: MagnetLayout) -> Bill:
     """What a layout costs in materials, beside paint of the same length."""
-    costs = unit_costs()
+    costs, count = unit_costs(), len(layout.holes)
+    on_surface = layout.installation.on_surface
     alternatives = [CostRow(costs[PAINT], round(layout.length_m, 2))]
     if isinstance(layout.tag, InformationTag):
         alternatives.append(CostRow(costs[_RFID], 1))
-    return Bill((CostRow(costs[_MAGNET], len(layout.holes)),), tuple(alternatives))
+    materials = tuple(CostRow(costs[item], count) for item in (_ON_SURFACE if on_surface else _IN_HOLE))
+    return Bill(materials, tuple(alternatives), (UnpricedRow(ADHESIVE, count, "each"),) if on_surface else ())
 
 
-# === What is checked before a layout is drilled: each check with its figure, its limit and where the limit comes from.
+# === How far the decoder reads: the proven range, from the measured share of magnets that are read.
 
 
-READABLE_CLEARANCE_M = 0.30
-"""Clearance up to which tags are read. [m] Source: METRO section 7.3."""
+PROVEN_RECALL = 0.95
+"""[1] least share of the magnets of a kind that must be read at a distance that counts as proven. Source: by hand;
+METRO calls 30 cm reliable with 0.87 and 0.93 (section 7.3)."""
+RECALL_SOURCE = "docs/benchmarks.md (recall)"
+"""Of app/planning/data/magnet_recall.csv."""
+
+
+class MagnetRecall(NamedTuple):
+    """Log-odds with which a magnet of a kind is read, by distance from the sensors to its centre."""
+
+    distance_m: Floats
+    log_odds: Floats
+
+    def share_at(self, distance_m: float) -> float:
+        """Share of the magnets that are read; linear in the log-odds between the measured distances."""
+        return float(scipy.special.expit(np.interp(distance_m, self.distance_m, self.log_odds)))
+
+    @property
+    def proven_m(self) -> float:
+        """Largest distance up to which `PROVEN_RECALL` is read. [m]"""
+        falling = -np.minimum.accumulate(self.log_odds)
+        return float(np.interp(-scipy.special.logit(PROVEN_RECALL), falling, self.distance_m))
+
+
+@lru_cache(maxsize=2)
+def magnet_recall(orientation: Orientation) -> MagnetRecall:
+    """The measured table of a kind of magnet."""
+    rows = read_figures("magnet_recall.csv")
+    read = np.array([float(row["upright" if orientation is Orientation.UP else "lying"]) for row in rows])
+    count = np.array([float(row["magnets"]) / 2 for row in rows])
+    log_odds = scipy.special.logit((read * count + 0.5) / (count + 1))  # Jeffreys' prior: none is sure
+    return MagnetRecall(np.array([float(row["distance_m"]) for row in rows]), np.asarray(log_odds))
+
+
+# === What is checked before a layout is installed: each check with its figure, limit and where the limit comes from.
+
+
 HALF_BAR_M = 1.77 / 2
 """Half of METRO's sensor bar. [m] Source: METRO section 5.1."""
 REACTION_S = 2.5
@@ -69,6 +116,19 @@ REACTION_S = 2.5
 DECELERATION_M_S2 = 3.4
 """Comfortable deceleration. [m/s2] Source: AASHTO Green Book (2018), section 3.2.2. By these two the 20 m before a stop
 line of METRO section 6.3 serve up to 5.9 m/s."""
+WHEEL_CIRCUMFERENCE_M = (1.8, 2.3)
+"""Rolling circumference of the wheels of passenger cars and vans, smallest and largest. [m] Source: tyres of 0.29 to
+0.37 m, as `WHEEL_RADII_M` of benchmarks/magnets/drawn_scenes.py."""
+TURNS = (0.5, 1.0, 2.0)
+"""Turns of a wheel between the magnets of a line at which its field looks like the wheel's own. Source: at 33 cm,
+`matched-7` reads 0.82, 0.78 and 0.98 of the magnets of lines 0.5, 1 and 2 turns apart, 1.00 of those 2.5 and 3
+turns apart (10 drives each of `draw_line_per_turn`, seed 7001), and 1.00 of tags with gaps of 1, 2 and 3 turns."""
+TURN_SLACK = 0.03
+"""Share of a turn by which a spacing must differ. Source: as `TURNS`, 0.97 and 1.03 turns are read like other lines."""
+MAX_SHELL_MM = 25.4
+"""Height of what stands on the road. [mm] Source: MUTCD (2009), section 3B.11: permanent raised markers are about an
+inch high at most."""
+SHELL_NOTE = "height of the shells on the road; snow ploughs take off what stands on it"
 _SERVED = 0.95  # share of a kind of vehicle that must have a readable clearance
 _WANDER_M = 0.5  # [m] a vehicle wanders in its lane
 _TOLERANCE_M = 0.0005  # [m] rounding of positions
@@ -104,8 +164,16 @@ class Site:
         Field(max_length=8, description="Vehicles to be served: sedan, utility, van, heavy truck."),
     ] = ("sedan", "utility")
     readable_clearance_m: Annotated[
-        Number, Field(description="Clearance up to which vehicles read, 0.05 to 1. [m]")
-    ] = READABLE_CLEARANCE_M
+        Number | None,
+        Field(
+            description="Distance from the sensors down to the magnets up to which vehicles read, 0.05 to 1; without, "
+            "the decoder's proven range. [m]"
+        ),
+    ] = None
+    wheel_circumference_m: Annotated[
+        tuple[Number, Number],
+        Field(description="Smallest and largest rolling circumference of the vehicles' wheels, 0.5 to 5. [m]"),
+    ] = WHEEL_CIRCUMFERENCE_M
     reaction_s: Annotated[Number, Field(description="Reaction time of the driver or the system, 0 to 10. [s]")] = (
         REACTION_S
     )
@@ -120,6 +188,7 @@ class Site:
         _check_range("readable_clearance_m", self.readable_clearance_m, 0.05, 1.0, "m")
         _check_range("reaction_s", self.reaction_s, 0.0, 10.0, "s")
         _check_range("deceleration_m_s2", self.deceleration_m_s2, 0.5, 10.0, "m/s2")
+        check_circumference(self.wheel_circumference_m, "wheel_circumference_m")
         if self.stop_line_chainage_m is not None and self.design_speed_m_s is None:
             raise InvalidParameter(
                 "the distance to a stop line is checked for the design speed, which is missing",
@@ -133,6 +202,18 @@ class Site:
                 raise InvalidParameter(
                     f"{name[:40]!r} is no known kind of vehicle", field="vehicles", limit=", ".join(known)
                 )
+
+
+def check_circumference(range_m: tuple[float, float], field: str) -> None:
+    """Refuse a range of circumferences that no wheels have."""
+    low, high = range_m
+    if not 0.5 <= low <= high <= 5.0:
+        raise InvalidParameter(
+            f"the circumferences are {low:g} to {high:g} m",
+            field=field,
+            limit="smallest and largest, 0.5 to 5 m",
+            cure=f"passenger cars and vans have {WHEEL_CIRCUMFERENCE_M[0]:g} to {WHEEL_CIRCUMFERENCE_M[1]:g} m",
+        )
 
 
 def _check_range(name: str, value: float | None, low: float, high: float, unit: str) -> None:
@@ -165,11 +246,14 @@ def check_layout(layout: MagnetLayout, site: Site, neighbours: Sequence[Neighbou
     checks = [_spacing(layout)]
     if isinstance(layout.tag, LineTag):
         checks.append(_line_spacing(layout))
+        checks.append(_wheel_turns(layout, site))
     else:
         checks.append(_bend(layout))
         if site.stop_line_chainage_m is not None and site.design_speed_m_s is not None:
             checks.append(_reaction(layout, site.stop_line_chainage_m, site.design_speed_m_s, site))
-    checks += [_clearance(name, site.readable_clearance_m) for name in site.vehicles]
+    checks += [_clearance(name, layout, site.readable_clearance_m) for name in site.vehicles]
+    if layout.installation.on_surface:
+        checks.append(_shell(layout.installation))
     checks += _neighbours(layout, neighbours)
     return tuple(checks)
 
@@ -229,17 +313,80 @@ def _reaction(layout: MagnetLayout, stop_line_m: float, speed_m_s: float, site: 
     )
 
 
-def _clearance(vehicle: str, readable_m: float) -> Check:
+def served_distance_m(vehicle: str, installation: Installation) -> float:
+    """Distance from the sensors to the magnets that 95 % of a kind of vehicle are within. [m]"""
     mean_m, std_m = vehicle_clearances()[vehicle]
-    share = float(scipy.special.ndtr((readable_m - mean_m) / std_m))
+    return installation.distance_m(mean_m + float(scipy.special.ndtri(_SERVED)) * std_m)
+
+
+def served_sentence(vehicle: str, installation: Installation, readable_m: float) -> str:
+    """Which share of a kind of vehicle is within a readable distance, and how the distance comes about."""
+    mean_m, std_m = vehicle_clearances()[vehicle]
+    share = float(scipy.special.ndtr((readable_m - installation.distance_m(mean_m)) / std_m))
+    depth = f"magnets {100 * installation.depth_m:.1f} cm deep"
+    if installation.depth_m < 0:
+        depth = "magnets on the road" if installation.on_surface else "magnets on the road, as no depth is stated"
+    return f"ground clearance of {_SERVED:.0%} of them, and {depth}; {share:.0%} are within reach"
+
+
+def readable_m_of(layout: MagnetLayout) -> float:
+    """Proven range of the decoder for the magnets of a layout. [m]"""
+    return magnet_recall(layout.holes[0].orientation).proven_m
+
+
+def _clearance(vehicle: str, layout: MagnetLayout, stated_m: float | None) -> Check:
+    readable_m = readable_m_of(layout) if stated_m is None else stated_m
+    source = RECALL_SOURCE if stated_m is None else "readable_clearance_m of the site"
     return _at_most(
         f"clearance-{vehicle.replace(' ', '-')}",
-        mean_m + float(scipy.special.ndtri(_SERVED)) * std_m,
+        served_distance_m(vehicle, layout.installation),
         readable_m,
         "m",
-        "METRO figure 14a, section 7.3",
-        f"{_SERVED:.0%} of them have less; {share:.0%} can read the tag",
+        f"METRO figure 14a; {source}",
+        served_sentence(vehicle, layout.installation, readable_m),
     )
+
+
+def _shell(installation: Installation) -> Check:
+    return _at_most(
+        "shell-height",
+        installation.height_mm,
+        MAX_SHELL_MM,
+        "mm",
+        "MUTCD (2009), section 3B.11",
+        SHELL_NOTE,
+    )
+
+
+# === Spacings of lines at which the magnets repeat with the turns of a wheel, as its own field does.
+
+
+def turn_bands_m(circumference_m: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+    """Spacings of lines to avoid, in rising order: smallest and largest of each band. [m]"""
+    low, high = circumference_m
+    return tuple((turns * low * (1 - TURN_SLACK), turns * high * (1 + TURN_SLACK)) for turns in TURNS)
+
+
+def turn_margin_m(spacing_m: float, circumference_m: tuple[float, float]) -> float:
+    """How far a spacing is outside of the bands to avoid; negative inside one. [m]"""
+    return min(max(low - spacing_m, spacing_m - high) for low, high in turn_bands_m(circumference_m))
+
+
+def turn_cure(circumference_m: tuple[float, float]) -> str:
+    """Spacings that are left, for people."""
+    edges = [0.0, *(edge for band in turn_bands_m(circumference_m) for edge in band), MAX_LINE_SPACING_M]
+    free = [(max(a, MIN_GAP_M), b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > max(a, MIN_GAP_M)]
+    return "choose " + ", ".join(f"{a:.2f} to {b:.2f}" for a, b in free) + " m"
+
+
+def _wheel_turns(layout: MagnetLayout, site: Site) -> Check:
+    spacing_m = float(np.median(np.diff([hole.along_m for hole in layout.holes])))
+    low, high = site.wheel_circumference_m
+    margin_m = turn_margin_m(spacing_m, site.wheel_circumference_m)
+    note = f"{spacing_m:.2f} m from half, one or two turns of wheels of {low:g} to {high:g} m"
+    if margin_m < 0:
+        note = f"{spacing_m:.2f} m repeats with wheels; {turn_cure(site.wheel_circumference_m)}"
+    return _at_least("wheel-turns", margin_m, 0.0, "m", "docs/benchmarks.md: lines of magnets", note)
 
 
 def _neighbours(layout: MagnetLayout, neighbours: Sequence[Neighbour]) -> list[Check]:
@@ -262,7 +409,7 @@ def _neighbours(layout: MagnetLayout, neighbours: Sequence[Neighbour]) -> list[C
     ]
 
 
-# === A layout with its checks and its bill of materials: what the writers of drilling sheets take.
+# === A layout with its checks and its bill of materials: what the writers of sheets take.
 
 
 def drilling_sheet(

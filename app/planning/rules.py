@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import date
+from enum import StrEnum
 from functools import cache, lru_cache
 from importlib import resources
 from itertools import islice
@@ -37,9 +38,10 @@ from ruamel.yaml.tokens import (
 from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, naming
 from app.formats.alignments.geometry import EventKind
 from app.formats.json_text import check_values, parse_json
+from app.markers.magnet import Installation
 from app.markers.magnet_design import TagDesign
 from app.markers.plate import RECOMMENDED_SCHEME, PlateGeometry, PlateScheme, recommended_geometry
-from app.planning.magnet_checks import vehicle_clearances
+from app.planning.magnet_checks import WHEEL_CIRCUMFERENCE_M, check_circumference, vehicle_clearances
 from app.radio.settings import RadioSettings, Region
 from app.values import JsonObject
 
@@ -189,16 +191,37 @@ class LineRules(_Part):
     offset_m: float = Field(default=0.0, ge=-0.5, le=0.5, description="From the painted line, left positive.")
 
 
+class TagSize(StrEnum):
+    """Size of information tags: METRO's, or longer ones for higher speeds (METRO section 10)."""
+
+    STREET = "street"
+    FREEWAY = "freeway"
+
+    @property
+    def lengths_m(self) -> tuple[float, float]:
+        """Length and segment. [m] Source: METRO section 7.1; docs/plans.md has the codes by speed."""
+        return (4.0, 0.5) if self is TagSize.STREET else (12.0, 1.0)
+
+
 class TagRules(Ahead):
     """Information tags ahead of events, with the meaning that the event has there."""
 
     at: list[EventKind] = [EventKind.STOP_LINE, EventKind.ARROW, EventKind.CURVE, EventKind.SPEED_LIMIT]
     before: Literal["stopping_distance", "reaction_distance"] | float = "reaction_distance"
-    length_m: float = Field(default=4.0, ge=1.0, le=20.0)
-    segment_m: float = Field(default=0.5, ge=0.05, le=2.0)
+    size: TagSize = Field(default=TagSize.STREET, description="Sets `length_m` and `segment_m`: `freeway` is longer.")
+    length_m: float = Field(default=4.0, ge=1.0, le=30.0, description="12 by default for `freeway`.")
+    segment_m: float = Field(default=0.5, ge=0.05, le=5.0, description="1 by default for `freeway`.")
     magnets: int = Field(default=3, ge=2, le=7)
     clearance_class: str = Field(default="utility", description="Kind of vehicle that must be served.")
     codebook: str | None = Field(default=None, description="Name of the agency's codebook; without, a new one.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lengths_of_size(cls, rules: object) -> object:
+        if not isinstance(rules, dict) or rules.get("size") not in list(TagSize):
+            return rules
+        length_m, segment_m = TagSize(rules["size"]).lengths_m
+        return {"length_m": length_m, "segment_m": segment_m, **rules}
 
 
 class CerpmRules(_Part):
@@ -265,6 +288,18 @@ class CameraRules(_Part):
 _CONDITION = "(day|night|rain|shade|wear|dirt)"
 
 
+class VehicleRules(_Part):
+    """The vehicles that read the markers."""
+
+    wheel_circumference_m: tuple[float, float] = Field(
+        default=WHEEL_CIRCUMFERENCE_M,
+        description="Smallest and largest rolling circumference of the wheels: no line of magnets repeats with them.",
+    )
+    read_alone: bool = Field(
+        default=True, description="Some vehicles read plates without the registry: plain positions get a warning."
+    )
+
+
 class PredictionRules(_Part):
     """Circumstances for which the checks predict read rates and path errors."""
 
@@ -273,7 +308,12 @@ class PredictionRules(_Part):
     )
     speed_share: float = Field(default=1.0, ge=0.1, le=1.5, description="Of the design speed.")
     lost_share: float = Field(default=0.0, ge=0.0, le=0.9, description="Share of the markers that are missing.")
-    clearance_m: float = Field(default=0.16, ge=0.05, le=0.6, description="Of the magnetometers above the road.")
+    clearance_m: float = Field(
+        default=0.16,
+        ge=0.05,
+        le=0.6,
+        description="Of the magnetometers above the road; the depth of the magnets is added.",
+    )
     survey_rmse_m: float = Field(default=0.03, ge=0.0, le=2.0, description="Of the registered positions, horizontal.")
     min_read_rate: float = Field(default=0.9, ge=0.0, le=1.0, description="Lower predicted read rates are reported.")
 
@@ -292,8 +332,8 @@ class CostItem(_Part):
     """One entry of the agency's price list."""
 
     item: str = Field(min_length=1, max_length=80)
-    per: Literal["plate", "magnet", "tag", "cerpm", "hole", "marker", "metre_of_lane", "day", "plan"] = Field(
-        description="What the price is multiplied by; days come from `per_day`."
+    per: Literal["plate", "magnet", "tag", "cerpm", "hole", "shell", "marker", "metre_of_lane", "day", "plan"] = Field(
+        description="What the price is multiplied by; `shell`: magnets on the surface. Days come from `per_day`."
     )
     price: float = Field(ge=0.0, le=1e9)
     pay_item: str | None = Field(default=None, max_length=40)
@@ -306,17 +346,6 @@ class Costs(_Part):
     currency: str = Field(default="USD", pattern="^[A-Z]{3}$")
     items: list[CostItem] = []
     markers_per_day: float | None = Field(default=None, gt=0.0, description="Markers that a crew installs in a day.")
-
-
-class Installation(_Part):
-    """Holes for magnets, for drawings and sheets; data of the agency and of the magnets' supplier."""
-
-    hole_diameter_mm: float | None = Field(
-        default=None, ge=22.0, le=200.0, description="A bare METRO magnet of 15 x 15 x 9.5 mm needs at least 22 mm."
-    )
-    hole_depth_mm: float | None = Field(
-        default=None, ge=10.0, le=300.0, description="From the road's surface to the bottom of the hole."
-    )
 
 
 class Tolerances(_Part):
@@ -342,11 +371,17 @@ class PlanRules(_Part):
     avoid: AvoidRules = AvoidRules()
     temporary: Temporary | None = None
     cameras: list[CameraRules] = Field(default=[CameraRules()], min_length=1, max_length=10)
+    vehicles: VehicleRules = VehicleRules()
     predictions: PredictionRules = PredictionRules()
     quality: Quality | None = None
     costs: Costs = Costs()
     installation: Installation = Installation()
     tolerances: Tolerances = Tolerances()
+
+    @property
+    def magnet_distance_m(self) -> float:
+        """Distance from the sensors of the predictions down to the magnets. [m]"""
+        return self.installation.distance_m(self.predictions.clearance_m)
 
     @model_validator(mode="after")
     def _cameras_differ(self) -> PlanRules:
@@ -420,7 +455,8 @@ def check_rules(document: object) -> PlanRules:
             cure="see docs/plans/rules-rural-plates.yaml",
         )
     try:
-        rules = PlanRules.model_validate(document)
+        with naming("installation"):  # the one part that checks itself
+            rules = PlanRules.model_validate(document)
     except ValidationError as error:
         raise _invalid(error, document) from None
     _check_contradictions(rules)
@@ -611,6 +647,7 @@ def _check_contradictions(rules: PlanRules) -> None:
     if plates := rules.plates:
         with naming("plates"):
             PlateGeometry(plates.n, plates.unit_mm, plates.gap_mm, plates.thickness_mm)
+    check_circumference(rules.vehicles.wheel_circumference_m, "vehicles.wheel_circumference_m")
     if rules.tags:
         _check_tags(rules.tags)
     if lines := rules.lines:

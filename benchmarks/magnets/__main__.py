@@ -239,7 +239,7 @@ def run_wheel(seed: int, short: bool) -> Result:
 def run_lines(seed: int, short: bool) -> Result:
     """Lines that look like the noise of a wheel."""
     rows: list[Sequence[object]] = []
-    for spacing in (0.97, 0.99, 1.0, 1.01, 1.03):
+    for spacing in (0.5, 0.97, 0.99, 1.0, 1.01, 1.03, 2.0):
         for clearance_m in (0.20, 0.33):
             total, shares = Tally(), []
             for k in range(3 if short else 20):

@@ -9,13 +9,16 @@ from pyproj import Geod
 
 from app.encoders.magnet import place_line, place_tag
 from app.errors import InvalidParameter
-from app.markers.magnet import InformationTag, LineStyle, Orientation
+from app.markers.magnet import HALF_HEIGHT_M, InformationTag, Installation, LineStyle, Mounting, Orientation
 from app.markers.reading import Check
 from app.planning.magnet_checks import (
+    ADHESIVE,
+    PROVEN_RECALL,
     Neighbour,
     Site,
     bill_of_materials,
     check_layout,
+    magnet_recall,
     reaction_distance_m,
     vehicle_clearances,
 )
@@ -85,11 +88,78 @@ def test_vehicles_are_served_up_to_the_readable_clearance() -> None:
         "van": pytest.approx((0.288, 0.01939)),
         "heavy truck": pytest.approx((0.372, 0.02786)),
     }
-    passed = {n: c.passed for n, c in checks_of(TAG, Site(vehicles=ALL_VEHICLES)).items() if n.startswith("clearance")}
-    assert list(passed.values()) == [True, True, False, False]
+    names = [f"clearance-{name.replace(' ', '-')}" for name in ALL_VEHICLES]
     further = checks_of(TAG, Site(vehicles=ALL_VEHICLES, readable_clearance_m=0.35))
-    assert [further[name].passed for name in passed] == [True, True, True, False]
-    assert further["clearance-sedan"].figure == pytest.approx(0.155 + 1.645 * 0.01581, abs=1e-4)
+    assert [further[name].passed for name in names] == [True, True, True, False]
+    assert further["clearance-sedan"].figure == pytest.approx(0.155 + 1.645 * 0.01581 - HALF_HEIGHT_M, abs=1e-4)
+    proven = checks_of(TAG, Site(vehicles=ALL_VEHICLES))
+    assert {proven[name].limit for name in names} == {round(magnet_recall(Orientation.FORWARD).proven_m, 4)}
+    line = place_line(STRAIGHT, LineStyle.SOLID, name="line", to_m=60.0)
+    limits = {c.limit for c in check_layout(line, Site()) if c.name.startswith("clearance")}
+    assert limits == {round(magnet_recall(Orientation.UP).proven_m, 4)}
+
+
+def test_the_proven_range_is_where_the_measured_recall_ends() -> None:
+    for orientation in Orientation:
+        recall = magnet_recall(orientation)
+        shares = [recall.share_at(d) for d in recall.distance_m.tolist()]
+        assert shares == sorted(shares, reverse=True)
+        assert (
+            recall.share_at(recall.proven_m - 0.001) >= PROVEN_RECALL - 1e-6 >= recall.share_at(recall.proven_m + 0.001)
+        )
+        assert recall.share_at(0.05) == shares[0] > 0.99  # nearer than anything measured
+        assert recall.share_at(1.0) < 0.06
+
+
+def depth_of(name: str, **installation: object) -> Check:
+    fixed = Installation(**installation)  # type: ignore[arg-type]
+    layout = place_tag(STRAIGHT, TAG, 50.0, name="tag", installation=fixed)
+    return {c.name: c for c in check_layout(layout, Site(vehicles=("sedan",)))}[name]
+
+
+def test_the_depth_of_magnets_adds_to_the_clearance() -> None:
+    flush, deep = (depth_of("clearance-sedan", hole_depth_mm=depth) for depth in (30.0, 300.0))
+    assert deep.figure - flush.figure == pytest.approx(0.27)
+    assert (flush.passed, deep.passed) == (True, False)
+    assert "29.5 cm deep" in deep.note
+    assert depth_of("clearance-sedan", mounting="surface").figure == depth_of("clearance-sedan").figure < flush.figure
+
+
+def test_shells_on_the_road_are_no_higher_than_raised_markers() -> None:
+    assert depth_of("shell-height", mounting="surface").passed
+    assert depth_of("shell-height", mounting="surface", shell_height_mm=25.0).passed
+    assert not depth_of("shell-height", mounting="surface", shell_height_mm=30.0).passed
+    with pytest.raises(KeyError):
+        depth_of("shell-height")
+
+
+@pytest.mark.parametrize(
+    ("installation", "field"),
+    [
+        ({"mounting": "surface", "hole_depth_mm": 30.0}, "hole_depth_mm"),
+        ({"mounting": "surface", "hole_diameter_mm": 30.0}, "hole_diameter_mm"),
+        ({"shell_height_mm": 15.0}, "shell_height_mm"),
+    ],
+)
+def test_a_size_of_the_other_mounting_is_refused(installation: dict[str, object], field: str) -> None:
+    with pytest.raises(InvalidParameter) as caught:
+        Installation(**installation)  # type: ignore[arg-type]
+    assert caught.value.field == field
+    assert caught.value.limit
+    assert caught.value.cure
+
+
+@pytest.mark.parametrize(
+    ("spacing_m", "passed"),
+    [(0.8, True), (1.0, False), (1.4, True), (1.8, False), (2.0, False), (2.3, False), (2.5, True), (4.0, False),
+     (5.0, True), (6.0, True)],
+)  # fmt: skip
+def test_lines_do_not_repeat_with_the_turns_of_wheels(spacing_m: float, passed: bool) -> None:
+    line = place_line(STRAIGHT, LineStyle.SOLID, name="line", to_m=60 * spacing_m / 6, spacing_m=spacing_m)
+    check = {c.name: c for c in check_layout(line, Site())}["wheel-turns"]
+    assert check.passed == passed == ("choose" not in check.note)
+    bus = check_layout(line, Site(wheel_circumference_m=(3.1, 3.2)))  # half 1.55, one 3.15, two 6.3
+    assert {c.name: c.passed for c in bus}["wheel-turns"]
 
 
 def beside(distance_m: float, orientation: Orientation = Orientation.FORWARD) -> Neighbour:
@@ -128,6 +198,7 @@ def test_a_long_tag_on_a_sharp_bend_leaves_the_lane(bend: LaneLine) -> None:
         ({"readable_clearance_m": 30.0}, "readable_clearance_m"),
         ({"reaction_s": -1.0}, "reaction_s"),
         ({"deceleration_m_s2": 0.0}, "deceleration_m_s2"),
+        ({"wheel_circumference_m": (2.3, 1.8)}, "wheel_circumference_m"),
     ],
 )
 def test_a_site_outside_the_limits_is_refused_by_name(options: dict[str, object], field: str) -> None:
@@ -155,3 +226,14 @@ def test_a_line_costs_less_than_the_cheapest_paint() -> None:
     assert bill.total_usd / 300 == pytest.approx(0.17, abs=0.001)  # METRO section 8.1
     assert (bill.paint.low_usd, bill.paint.high_usd) == (63.0, 2310.0)
     assert all(row.cost.source.startswith("METRO") for row in (*bill.materials, *bill.alternatives))
+
+
+def test_magnets_on_the_surface_are_billed_with_shells_and_adhesive() -> None:
+    layout = place_tag(STRAIGHT, TAG, 50.0, name="tag", installation=Installation(mounting=Mounting.SURFACE))
+    bill = bill_of_materials(layout)
+    assert bill.total_usd == 3.0  # METRO section 8.1: 1 USD each, of it 0.25 for the shell
+    assert [(row.cost.item, row.quantity, row.high_usd) for row in bill.materials] == [
+        ("magnet", 3, 2.25), ("protective shell", 3, 0.75),
+    ]  # fmt: skip
+    assert [(row.item, row.quantity) for row in bill.without_price] == [(ADHESIVE, 3)]
+    assert bill_of_materials(place_tag(STRAIGHT, TAG, 50.0, name="tag")).without_price == ()

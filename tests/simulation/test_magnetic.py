@@ -12,7 +12,7 @@ from app.sensors.magnetometer_bar import MagnetometerBar
 from app.simulation.magnetic.dipoles import dipole_field_ut
 from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import CanBus, Chip
-from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, Spread
+from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, Spread, place_magnets, tag_magnets
 
 QUIET = Chip(
     noise_ut=(0, 0, 0), count_ut=(0, 0, 0), offset_ut=0, gain=0, misalignment_deg=0, soft_iron=0, jitter=0, stale=0,
@@ -73,6 +73,14 @@ def test_the_wrong_way_turns_order_and_polarity() -> None:
     assert [m.polarity.value for m in drive.magnets] == ["N", "S", "S"]
     t = [m.t_s for m in drive.magnets]
     assert (t[1] - t[0]) / (t[2] - t[1]) == pytest.approx(3, rel=0.1)
+
+
+def test_a_buried_magnet_is_that_much_farther_below_the_bar() -> None:
+    rng = np.random.default_rng(1)
+    magnets = [RoadMagnet(5.0, 0.0, Polarity.N, Orientation.UP, depth_m=depth) for depth in (-0.005, 0.295)]
+    tag = PlacedTag(InformationTag.from_gaps("NS", 1.0, [2]), 8.0, depth_m=0.1)
+    dipoles, _at = place_magnets([*magnets, *tag_magnets([tag])], Road(20.0), EXACT, rng)
+    assert dipoles[:, 2] == pytest.approx([0.005, -0.295, -0.1, -0.1])
 
 
 def test_the_earths_field_turns_with_the_heading() -> None:

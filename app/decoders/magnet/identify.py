@@ -22,7 +22,7 @@ from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFindi
 from app.errors import InvalidParameter
 from app.geodesy import LocalizationGrade, enu_from_wgs84, wgs84_from_enu
 from app.inputs import Number, Whole
-from app.markers.magnet import InformationTag, Polarity, check_magnet_count, segments_in
+from app.markers.magnet import HALF_HEIGHT_M, InformationTag, Polarity, check_magnet_count, segments_in
 from app.markers.magnet_design import Meaning
 from app.markers.reading import Matrix
 from app.sensors.magnetometer_bar import MagnetometerBar
@@ -51,6 +51,7 @@ class RegisteredTag:
     grade: str  # a `LocalizationGrade`
     localization_warnings: tuple[str, ...] = ()  # what makes its position unfit for localization
     meaning: Meaning | None = None
+    depth_m: float = -HALF_HEIGHT_M  # [m] of its magnets' centres below the road
 
 
 # === Identification.

@@ -87,7 +87,11 @@ class LikelyMistake:
 
 
 def find_mistakes(
-    trace: MagnetTrace, bar: MagnetometerBar, findings: Sequence[Finding], candidates: TagCandidates | None = None
+    trace: MagnetTrace,
+    bar: MagnetometerBar,
+    findings: Sequence[Finding],
+    candidates: TagCandidates | None = None,
+    depth_m: float = 0.0,
 ) -> list[LikelyMistake]:
     """Mistakes in units and axes that a recording shows.
 
@@ -99,6 +103,8 @@ def find_mistakes(
         What was read in it.
     candidates : TagCandidates, optional
         Tags that may be on the road.
+    depth_m : float
+        Of the magnets, which the clearance of the bar contains beside that above the road. [m]
     """
     mistakes = [mistake] if (mistake := compare_with_earth(trace, bar)) is not None else []
     sure = _sure(findings)
@@ -111,11 +117,13 @@ def find_mistakes(
     ):
         mistake = compare_with_dipoles(trace, bar, candidates)
     if mistake is None and len(sure) >= MIN_MAGNETS:
-        mistake = compare_with_clearance(sure, bar)
+        mistake = compare_with_clearance(sure, bar, depth_m)
     return [*mistakes, mistake] if mistake is not None else mistakes
 
 
-def compare_with_clearance(magnets: Sequence[MagnetReading], bar: MagnetometerBar) -> LikelyMistake | None:
+def compare_with_clearance(
+    magnets: Sequence[MagnetReading], bar: MagnetometerBar, depth_m: float = 0.0
+) -> LikelyMistake | None:
     """The declared clearance, if sure magnets lie elsewhere."""
     if bar.clearance_m is None:
         return None
@@ -125,7 +133,7 @@ def compare_with_clearance(magnets: Sequence[MagnetReading], bar: MagnetometerBa
     return LikelyMistake(
         "bar.clearance_m",
         f"{len(magnets)} magnets lie {100 * seen_m:.0f} cm below the bar, {100 * bar.clearance_m:.0f} cm were declared",
-        f"declare {seen_m:.2f} m, or leave the clearance out",
+        f"declare {seen_m - depth_m:.2f} m, or leave the clearance out",
     )
 
 

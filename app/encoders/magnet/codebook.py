@@ -40,7 +40,13 @@ class CodebookRules:
     """How far apart codes are kept: for the fastest and highest vehicle to be served."""
 
     speed_m_s: Annotated[Number, Field(description="Speed at which codes must be read, 0.5 to 70. [m/s]")] = 13.4
-    clearance_m: Annotated[Number, Field(description="Clearance at which codes must be read, 0.05 to 1. [m]")] = 0.30
+    clearance_m: Annotated[
+        Number,
+        Field(
+            description="Distance from the sensors to the magnets at which codes must be read: the vehicle's clearance "
+            "and the magnets' depth, 0.05 to 1. [m]"
+        ),
+    ] = 0.30
     odometer: OdometerError = field(default_factory=OdometerError)
     # the polarities being read right
     confusion: Annotated[

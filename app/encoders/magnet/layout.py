@@ -1,4 +1,4 @@
-"""A tag on a lane -> holes to drill: where each magnet goes, and which way its north pole points.
+"""A tag on a lane -> holes to drill or shells to glue: where magnets go, and which way their north poles point.
 
 A tag is laid out straight, its first and its last magnet on the lane's line and the others between them: the distances
 that carry the code are those of equation 1 in the direction of the tag, on a bend as on a straight (METRO section 4.2,
@@ -9,14 +9,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 import scipy
 
 from app.errors import InvalidParameter
-from app.markers.magnet import MAX_LINE_SPACING_M, InformationTag, LineStyle, LineTag, Orientation, Polarity, Tag
+from app.markers.magnet import (
+    MAX_LINE_SPACING_M,
+    InformationTag,
+    Installation,
+    LineStyle,
+    LineTag,
+    Orientation,
+    Polarity,
+    Tag,
+)
 from app.markers.magnet_design import Meaning, check_name
 from app.markers.reading import Check
 from app.roads.lane_line import LaneLine, bearing_deg, left_of
@@ -70,6 +79,7 @@ class MagnetLayout:
     holes: tuple[Hole, ...]  # in the direction of travel
     bearing_deg: float  # [deg] of the tag, or of the line at its first magnet; clockwise from true north
     meaning: Meaning | None = None
+    installation: Installation = field(default_factory=Installation)
 
     @property
     def length_m(self) -> float:
@@ -91,6 +101,7 @@ def place_tag(
     name: str,
     offset_m: float = 0.0,
     meaning: Meaning | None = None,
+    installation: Installation = Installation(),
 ) -> MagnetLayout:
     """Lay out an information tag.
 
@@ -121,7 +132,7 @@ def place_tag(
     located = np.array([lane.locate(point) for point in points])
     polarities = [magnet.polarity for magnet in tag.magnets]
     holes = _holes(lane, along_m, located, points, polarities, bearing)
-    return MagnetLayout(name, tag, lane, holes, bearing, meaning)
+    return MagnetLayout(name, tag, lane, holes, bearing, meaning, installation)
 
 
 def place_line(
@@ -132,6 +143,7 @@ def place_line(
     from_m: float = 0.0,
     to_m: float | None = None,
     spacing_m: float = MAX_LINE_SPACING_M,
+    installation: Installation = Installation(),
 ) -> MagnetLayout:
     """Lay out line tags along a painted line, at equal distances along it.
 
@@ -172,7 +184,7 @@ def place_line(
     points = line.at(from_m + along_m)
     on_line = np.stack([from_m + along_m, np.zeros(len(along_m))], axis=1)
     holes = _holes(line, along_m, on_line, points, [tag.polarity] * len(points), None)
-    return MagnetLayout(name, tag, line, holes, bearing_deg(line.direction_at(from_m)))
+    return MagnetLayout(name, tag, line, holes, bearing_deg(line.direction_at(from_m)), installation=installation)
 
 
 def _check_chainage(field: str, chainage_m: float, lane: LaneLine) -> None:
@@ -278,11 +290,21 @@ class CostRow:
 
 
 @dataclass(frozen=True, slots=True)
+class UnpricedRow:
+    """A quantity of something that nobody publishes a price of."""
+
+    item: str
+    quantity: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
 class Bill:
     """Materials of a layout and their alternatives."""
 
-    materials: tuple[CostRow, ...]  # what is bought: the magnets in their shells
+    materials: tuple[CostRow, ...]  # what is bought: magnets and shells
     alternatives: tuple[CostRow, ...]  # paint along the same length; for an information tag also one rugged RFID tag
+    without_price: tuple[UnpricedRow, ...] = ()  # what is bought and is no part of the total
 
     @property
     def total_usd(self) -> float:
@@ -295,11 +317,11 @@ class Bill:
         return next(row for row in self.alternatives if row.cost.item == PAINT)
 
 
-# === The drilling sheet: a layout with its checks and its costs, for the writers.
+# === The sheet for the crew: a layout with its checks and its costs, for the writers.
 
 
 class SheetFormat(StrEnum):
-    """What a drilling sheet can be written as; the value is the file's extension."""
+    """What a sheet can be written as; the value is the file's extension."""
 
     PDF = "pdf"
     CSV = "csv"
@@ -313,12 +335,11 @@ class SheetFormat(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrillingSheet:
-    """What the crew, the planner and the buyer need of one layout; `holes` is what the agency states of the holes."""
+    """What the crew, the planner and the buyer need of one layout, drilled or glued onto the road."""
 
     layout: MagnetLayout
     checks: tuple[Check, ...]
     bill: Bill
-    holes: str = ""
 
     @property
     def passed(self) -> bool:

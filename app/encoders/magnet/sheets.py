@@ -1,38 +1,41 @@
-"""Drilling sheets as files: CSV, GeoJSON and PDF."""
+"""Sheets for the crew as files, of holes to drill or shells to glue onto the road: CSV, GeoJSON and PDF."""
 
 from __future__ import annotations
 
 import io
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
 from itertools import pairwise
-from typing import Any
 
 import orjson
 
-from app.encoders.magnet.layout import DrillingSheet, Hole, SheetFormat
+from app.encoders.magnet.layout import CostRow, DrillingSheet, Hole, SheetFormat, UnpricedRow
 from app.encoders.pdf import POINTS_PER_MM, Canvas, EmbeddedFont, PdfFile
 from app.formats.text import TableWriter
 from app.markers.magnet import InformationTag, Orientation, Polarity
 from app.values import JsonObject
 
-# === Drilling sheet -> CSV: one row a hole.
+# === Sheet -> CSV: one row a magnet.
 
 
 COLUMNS = (
     "layout", "code", "meaning", "hole", "chainage_m", "offset_m", "from_first_m", "from_previous_m", "lon_deg",
-    "lat_deg", "east_m", "north_m", "polarity", "phi_deg", "north_pole", "north_pole_bearing_deg",
+    "lat_deg", "east_m", "north_m", "polarity", "phi_deg", "north_pole", "north_pole_bearing_deg", "mounting",
+    "depth_m", "height_mm",
 )  # fmt: skip
 
 
 def write_sheet_csv(sheet: DrillingSheet) -> bytes:
-    """Write the holes as rows in UTF-8, with a header.
+    """Write the magnets as rows in UTF-8, with a header.
 
     Positions are WGS 84 to 0.1 mm; east and north are from the line's first point; from_first_m is along the tag or
-    the line, from_previous_m straight. Texts that a spreadsheet would take for a formula begin with an apostrophe.
+    the line, from_previous_m straight; depth_m is that of a magnet's centre below the road, negative above it; and
+    height_mm that of a shell. Texts that a spreadsheet would take for a formula begin with an apostrophe.
     """
     layout = sheet.layout
     meaning = layout.meaning.text if layout.meaning else ""
+    fixing = layout.installation
     stream = io.StringIO()
     writer = TableWriter(stream)
     writer.write_row(COLUMNS)
@@ -49,6 +52,9 @@ def write_sheet_csv(sheet: DrillingSheet) -> bytes:
                 hole.orientation.phi_deg,
                 hole.north_pole,
                 "" if bearing is None else fixed(bearing % 360.0, 3),
+                fixing.mounting.value,
+                fixed(fixing.depth_m, 4),
+                f"{fixing.height_mm:g}",
             ]
         )
     return stream.getvalue().encode()
@@ -60,14 +66,14 @@ def fixed(value: float, decimals: int) -> str:
     return text[1:] if float(text) == 0 and text.startswith("-") else text
 
 
-# === Drilling sheet -> GeoJSON (RFC 7946).
+# === Sheet -> GeoJSON (RFC 7946).
 
 
 _DECIMALS = 9
 
 
 def write_sheet_geojson(sheet: DrillingSheet) -> bytes:
-    """Write the holes as points, with the layout, its checks and its bill as a foreign member.
+    """Write the magnets as points, with the layout, its checks and its bill as a foreign member.
 
     Positions are WGS 84, longitude first, to 0.1 mm.
     """
@@ -98,6 +104,7 @@ def sheet_document(sheet: DrillingSheet) -> JsonObject:
                 "phi_deg": hole.orientation.phi_deg,
                 "north_pole": hole.north_pole,
                 "north_pole_bearing_deg": _rounded(hole.north_pole_bearing_deg),
+                "depth_m": round(layout.installation.depth_m, 4),
             },
         }
         for hole in layout.holes
@@ -116,6 +123,8 @@ def _summary(sheet: DrillingSheet) -> dict[str, object]:
         "meaning": None if meaning is None else {"kind": meaning.kind.value, "value": meaning.value},
         "bearing_deg": _rounded(layout.bearing_deg),
         "length_m": round(layout.length_m, 4),
+        "installation": layout.installation,
+        "height_mm": layout.installation.height_mm,
         "origin": {"lon_deg": lon_deg, "lat_deg": lat_deg, "height_m": height_m},
         "passed": sheet.passed,
         "checks": list(sheet.checks),
@@ -132,7 +141,8 @@ def _summary(sheet: DrillingSheet) -> dict[str, object]:
                 for row in rows
             ]
             for part, rows in (("materials", bill.materials), ("alternatives", bill.alternatives))
-        },
+        }
+        | {"without_price": [asdict(row) for row in bill.without_price]},
     }
 
 
@@ -141,9 +151,9 @@ def _rounded(degrees: float | None) -> float | None:
     return None if degrees is None else math.fmod(round(degrees, 3), 360.0)
 
 
-# === Drilling sheets to PDF: the plan to scale with every pole drawn, the table of holes, the checks and the bill.
+# === Sheets to PDF: the plan to scale with every pole drawn, the table of magnets, the checks and the bill.
 #
-# A4 on its side. Magnets are drawn larger than they are; the thin cross line through each is the place of its hole.
+# A4 on its side. Magnets are drawn larger than they are; the thin cross line through each is its place.
 
 
 PAGE_MM = (297.0, 210.0)
@@ -151,7 +161,7 @@ PLAN_MM = 250.0
 SCALES = (5, 10, 20, 25, 50, 100, 125)
 LINE_SCALE = 200
 HOLE_LINE_MM = 0.11
-"""Width of the cross lines that mark holes; nothing else on the sheet is so thin."""
+"""Width of the cross lines that mark places; nothing else on the sheet is so thin."""
 
 _LEFT_MM, _RIGHT_MM, _BOTTOM_MM = 15.0, 282.0, 16.0
 _PLAN_LEFT_MM = 23.5
@@ -163,9 +173,13 @@ _NOTES = (
     "Before gluing, hold a compass to each magnet: the pole marked N pushes the needle's north end away. "
     "Set each within 3 mm of its place.",
 )
+_SURFACE_NOTE = (
+    "Nothing is drilled. Clean and dry the road, and press each shell with its magnet into a bed of epoxy. "
+    "No traffic until it is hard: shells moved by up to 3 mm in the first 24 h, not after (METRO section 8.2)."
+)
 
 _HOLE_COLUMNS: tuple[tuple[str, float, Callable[[Hole, float], str]], ...] = (
-    ("hole", 24.0, lambda hole, gap: str(hole.number)),
+    ("magnet", 24.0, lambda hole, gap: str(hole.number)),
     ("from first [m]", 50.0, lambda hole, gap: fixed(hole.along_m, 3)),
     ("from previous [m]", 78.0, lambda hole, gap: fixed(gap, 3) if hole.number > 1 else "-"),
     ("chainage [m]", 100.0, lambda hole, gap: fixed(hole.chainage_m, 3)),
@@ -181,7 +195,7 @@ _HOLE_COLUMNS: tuple[tuple[str, float, Callable[[Hole, float], str]], ...] = (
 
 
 def write_sheet_pdf(sheet: DrillingSheet) -> bytes:
-    """Write a drilling sheet.
+    """Write a sheet: what to drill, or what to glue onto the road.
 
     Returns
     -------
@@ -213,6 +227,10 @@ class _Paper:
         self._begin()
 
     @property
+    def _title(self) -> str:
+        return "Surface mounting sheet" if self._sheet.layout.installation.on_surface else "Drilling sheet"
+
+    @property
     def canvas(self) -> Canvas:
         """The page that is drawn."""
         return self._pages[-1]
@@ -220,9 +238,9 @@ class _Paper:
     def to_bytes(self) -> bytes:
         """The file; every page gets its number and the number of pages."""
         for number, page in enumerate(self._pages, start=1):
-            footer = f"Waymark drilling sheet, page {number} of {len(self._pages)}"
+            footer = f"Waymark {self._title.lower()}, page {number} of {len(self._pages)}"
             page.text(_RIGHT_MM, 7, footer, font=_REGULAR, points=6.5, colour=_GREY, anchor="end")
-        file = PdfFile(f"Drilling sheet {self._sheet.layout.name}")
+        file = PdfFile(f"{self._title} {self._sheet.layout.name}")
         fonts = " ".join(f"/{name} {font.add_to(file)} 0 R" for name, font in self._fonts.items())
         resources = file.add(f"<< /Font << {fonts} >> >>".encode())
         for page in self._pages:
@@ -265,15 +283,16 @@ class _Paper:
         self.text(_RIGHT_MM, 196, verdict, 10, bold=True, anchor="end", colour=_BLACK if passed else _RED)
         meaning = f": {layout.meaning.text}" if layout.meaning else ""
         kind = "information tag" if isinstance(layout.tag, InformationTag) else f"{layout.tag.style} line"
-        holes = f"; holes: {self._sheet.holes}" if self._sheet.holes else ""
-        code = f"{kind} {layout.tag.text}  {layout.tag.tuple_text}{meaning}{holes}"
+        fixing = f"; {layout.installation.text}" if layout.installation.text else ""
+        code = f"{kind} {layout.tag.text}  {layout.tag.tuple_text}{meaning}{fixing}"
         self.text(_LEFT_MM, 190, code, 9, width=180)
         lon_deg, lat_deg, height_m = layout.lane.origin
         origin = f"east, north from {fixed(lon_deg, 9)}, {fixed(lat_deg, 9)}, height {height_m:g} m"
         self.text(_RIGHT_MM, 190, origin, 7.5, anchor="end", width=82)
         self.lines([(_LEFT_MM, 187.5), (_RIGHT_MM, 187.5)])
-        for i, note in enumerate(_NOTES):
-            self.text(_LEFT_MM, 10.5 - 3.5 * i, note, 6.5, colour=_GREY)
+        notes = (_SURFACE_NOTE, *_NOTES) if layout.installation.on_surface else _NOTES
+        for i, note in enumerate(reversed(notes)):
+            self.text(_LEFT_MM, 6.0 + 3.5 * i, note, 6.5, colour=_GREY)
         self.y_mm = 181.0
 
 
@@ -402,7 +421,7 @@ def _draw_holes(paper: _Paper, sheet: DrillingSheet) -> None:
 
 
 def _hole_titles(paper: _Paper) -> None:
-    paper.heading("Holes")
+    paper.heading("Magnets")
     for title, right, _ in _HOLE_COLUMNS:
         paper.text(right, paper.y_mm, title, 6.5, bold=True, anchor="end")
     paper.y_mm -= 5.0
@@ -426,19 +445,24 @@ def _draw_checks(paper: _Paper, sheet: DrillingSheet) -> None:
 
 def _draw_bill(paper: _Paper, sheet: DrillingSheet) -> None:
     bill = sheet.bill
-    rows: Sequence[tuple[str, Any]] = [
+    rows: list[tuple[str, CostRow | UnpricedRow]] = [
         *(("", row) for row in bill.materials),
+        *(("", unpriced) for unpriced in bill.without_price),
         *(("instead: ", row) for row in bill.alternatives),
     ]
     paper.need(8.0 + 4.6 * len(rows))
     paper.heading("Materials, without labour")
     for prefix, row in rows:
-        cost = row.cost
-        paper.text(_LEFT_MM, paper.y_mm, f"{prefix}{cost.item}", 7.5)
-        paper.text(100, paper.y_mm, f"{row.quantity:g} {cost.unit}", 7.5, anchor="end")
-        usd = f"{row.low_usd:.2f}" if row.low_usd == row.high_usd else f"{row.low_usd:.2f} - {row.high_usd:.2f}"
-        paper.text(150, paper.y_mm, f"{usd} USD", 7.5, anchor="end")
-        paper.text(156, paper.y_mm, cost.source, 7, colour=_GREY)
+        if isinstance(row, CostRow):
+            item, unit, source = row.cost.item, row.cost.unit, row.cost.source
+            usd = f"{row.low_usd:.2f}" if row.low_usd == row.high_usd else f"{row.low_usd:.2f} - {row.high_usd:.2f}"
+            price = f"{usd} USD"
+        else:
+            item, unit, source, price = row.item, row.unit, "", "no published price"
+        paper.text(_LEFT_MM, paper.y_mm, f"{prefix}{item}", 7.5)
+        paper.text(100, paper.y_mm, f"{row.quantity:g} {unit}", 7.5, anchor="end")
+        paper.text(150, paper.y_mm, price, 7.5, anchor="end")
+        paper.text(156, paper.y_mm, source, 7, colour=_GREY)
         paper.y_mm -= 4.6
 
 
@@ -446,11 +470,11 @@ def _bearing(degrees: float | None) -> str:
     return "-" if degrees is None else fixed(round(degrees, 2) % 360.0, 2)
 
 
-# === The file formats of drilling sheets, each with its writer.
+# === The file formats of sheets, each with its writer.
 
 
 def write_sheet(sheet: DrillingSheet, form: SheetFormat) -> bytes:
-    """Write a drilling sheet in one format."""
+    """Write a sheet in one format."""
     match form:
         case SheetFormat.PDF:
             return write_sheet_pdf(sheet)

@@ -11,8 +11,8 @@ from app.encoders.magnet import DrillingSheet
 from app.encoders.magnet.sheets import sheet_document
 from app.families.documents import MarkerDocument, marker_head, marker_place
 from app.families.magnet.layouts import LinePlace, TagPlace, site_of
-from app.markers.magnet import LineStyle, LineTag, parse_tag
-from app.markers.magnet_design import MagnetSpec, Meaning, StoredMeaning, meaning_of
+from app.markers.magnet import Installation, LineStyle, LineTag, parse_tag
+from app.markers.magnet_design import MagnetSpec, Meaning, StoredMeaning, installation_of, meaning_of
 from app.markers.reading import Check, MarkerRow
 from app.planning.magnet_checks import Site
 from app.values import JsonObject
@@ -55,6 +55,9 @@ class MagnetDocument(MarkerDocument):
     family: Literal["magnet"]
     code: InformationTagDocument | LineTagDocument
     layout: TagPlace | LinePlace
+    installation: Installation
+    depth_m: float
+    """Of the magnets' centres below the road; negative above it. [m]"""
 
 
 class LaneGeometryDocument(TypedDict):
@@ -101,10 +104,22 @@ class CostDocument(TypedDict):
     source: str
 
 
+class UnpricedDocument(TypedDict):
+    """A quantity of something that nobody publishes a price of."""
+
+    item: str
+    quantity: float
+    unit: str
+
+
 class BillDocument(TypedDict):
-    """Materials, what else could mark the road, and the total of the materials at the highest price."""
+    """Materials, what else could mark the road, and the total of the materials at the highest price.
+
+    What is `without_price` is no part of the total.
+    """
 
     materials: list[CostDocument]
+    without_price: list[UnpricedDocument]
     alternatives: list[CostDocument]
     total_usd: float
 
@@ -130,6 +145,8 @@ def magnet_document(row: MarkerRow) -> MagnetDocument:
         "family": "magnet",
         "code": _tag_document(spec),
         "layout": cast("TagPlace | LinePlace", spec["place"]),
+        "installation": (installation := installation_of(spec)),
+        "depth_m": installation.depth_m,
         **marker_place(row),
     }
 
@@ -154,6 +171,7 @@ def magnet_detail(row: MarkerRow, sheet: DrillingSheet) -> MagnetDetailDocument:
         "warnings": [check.name for check in sheet.checks if not check.passed],
         "bill": {
             "materials": summary["bill"]["materials"],
+            "without_price": summary["bill"]["without_price"],
             "alternatives": summary["bill"]["alternatives"],
             "total_usd": sheet.bill.total_usd,
         },
@@ -166,7 +184,8 @@ def _hole_document(hole: JsonObject) -> HoleDocument:
     properties = {
         name: value + 0.0 if isinstance(value, float) else value for name, value in hole["properties"].items()
     }
-    del properties["layout"], properties["code"], properties["hole"]
+    for name in ("layout", "code", "hole", "depth_m"):
+        del properties[name]
     return cast(HoleDocument, {"number": hole["id"], "lon_deg": lon_deg, "lat_deg": lat_deg, **properties})
 
 

@@ -16,8 +16,8 @@ from app.errors import InvalidParameter, naming
 from app.families.documents import Height, MarkerIn, Metres, ProvenanceIn
 from app.geodesy import PlacedPosition, place_position
 from app.inputs import Identifier, Number, StrictModel, Text
-from app.markers.magnet import InformationTag, LineStyle, LineTag, Orientation, parse_tag
-from app.markers.magnet_design import MagnetSpec, Meaning, StoredLane, meaning_of
+from app.markers.magnet import InformationTag, Installation, LineStyle, LineTag, Orientation, parse_tag
+from app.markers.magnet_design import MagnetSpec, Meaning, StoredLane, installation_of, meaning_of
 from app.markers.reading import Check, MarkerRow
 from app.planning.magnet_checks import Neighbour, Site, drilling_sheet
 from app.roads.lane_line import LaneLine
@@ -126,6 +126,7 @@ MAGNET_EXAMPLES: list[JsonValue] = [
             "geometry": {"type": "LineString", "coordinates": [[-84.48, 42.72635], [-84.4776, 42.72635]]},
         },
         "line": {"style": "dashed", "from_m": 10.0, "to_m": 100.0, "spacing_m": 6.0},
+        "installation": {"mounting": "surface", "shell_height_mm": 15.0},
     },
 ]
 
@@ -140,6 +141,7 @@ class MagnetIn(MarkerIn):
     tag: TagIn | None = None
     line: LineIn | None = None
     site: Site = Field(default_factory=Site)
+    installation: Installation = Field(default_factory=Installation)
 
     @model_validator(mode="after")
     def _tag_or_line(self) -> MagnetIn:
@@ -179,9 +181,10 @@ class MagnetIn(MarkerIn):
 
 
 LINE_TAG: Final = "line-tag"
-_LAID_OUT: Final = ("lane", "tag", "place", "meaning")
+_LAID_OUT: Final = ("lane", "tag", "place", "meaning", "installation")
 MAX_RESURVEY_M = 1.0
-"""Farthest that a survey may find a tag from its layout: drilling is right to millimetres, GNSS to centimetres. [m]"""
+"""Farthest that a survey may find a tag from its layout: magnets are set within millimetres, GNSS is right to
+centimetres. [m]"""
 _NEVER_BROKEN = ("magnet-spacing", "line-spacing")
 """Checks whose failure makes a layout unreadable; the others are for the planner to weigh."""
 
@@ -234,7 +237,7 @@ def worst_grade(placed: list[PlacedPosition]) -> PlacedPosition:
 
 def layout_of(name: str, spec: MagnetSpec) -> MagnetLayout:
     """Layout of a magnet marker by its id and its spec."""
-    return _layout(name, orjson.dumps({member: spec[member] for member in _LAID_OUT}))
+    return _layout(name, orjson.dumps({member: spec.get(member) for member in _LAID_OUT}))
 
 
 _FORMER_NAMES: Final = {"design_speed_mps": "design_speed_m_s", "deceleration_mps2": "deceleration_m_s2"}
@@ -244,7 +247,9 @@ _FORMER_NAMES: Final = {"design_speed_mps": "design_speed_m_s", "deceleration_mp
 def site_of(spec: MagnetSpec) -> Site:
     """The site of a stored layout."""
     stored = {_FORMER_NAMES.get(name, name): value for name, value in spec["site"].items()}
-    return Site(**{**stored, "vehicles": tuple(stored["vehicles"])})
+    for name in {"vehicles", "wheel_circumference_m"} & set(stored):
+        stored[name] = tuple(stored[name])
+    return Site(**stored)
 
 
 def sheet_of(name: str, spec: MagnetSpec) -> DrillingSheet:
@@ -261,11 +266,15 @@ def _layout(name: str, spec: bytes) -> MagnetLayout:
     stored = orjson.loads(spec)
     lane, place = _lane(stored["lane"]), stored["place"]
     tag, meaning = parse_tag(stored["tag"]), meaning_of(stored)
+    installation = installation_of(stored)
     if isinstance(tag, LineTag):
         with naming("line"):
-            return _place_line(lane, tag, LinePlace(**place), name)
+            return _place_line(lane, tag, LinePlace(**place), name, installation)
     with naming("tag"):
-        return place_tag(lane, tag, place["chainage_m"], name=name, offset_m=place["offset_m"], meaning=meaning)
+        return place_tag(
+            lane, tag, place["chainage_m"], name=name, offset_m=place["offset_m"], meaning=meaning,
+            installation=installation,
+        )  # fmt: skip
 
 
 def _lane(spec: StoredLane) -> LaneLine:
@@ -276,7 +285,7 @@ def _lane(spec: StoredLane) -> LaneLine:
         raise
 
 
-def _place_line(lane: LaneLine, tag: LineTag, place: LinePlace, name: str) -> MagnetLayout:
+def _place_line(lane: LaneLine, tag: LineTag, place: LinePlace, name: str, installation: Installation) -> MagnetLayout:
     end_m = lane.length_m if place.to_m is None else place.to_m
     if place.spacing_m > 0 and end_m - place.from_m > place.spacing_m * (MAX_MAGNETS - 1):
         raise InvalidParameter(
@@ -285,7 +294,10 @@ def _place_line(lane: LaneLine, tag: LineTag, place: LinePlace, name: str) -> Ma
             limit=f"{MAX_MAGNETS} magnets in one marker",
             cure="register the line in sections",
         )
-    return place_line(lane, tag.style, name=name, from_m=place.from_m, to_m=place.to_m, spacing_m=place.spacing_m)
+    return place_line(
+        lane, tag.style, name=name, from_m=place.from_m, to_m=place.to_m, spacing_m=place.spacing_m,
+        installation=installation,
+    )  # fmt: skip
 
 
 def check_never_broken(layout: MagnetLayout, checks: tuple[Check, ...]) -> None:

@@ -162,6 +162,7 @@ def magnet_columns(new: MagnetIn, tag: Tag, meaning: Meaning | None, rules: Mark
         "place": new.place,
         "site": asdict(new.site),
         "neighbours": [],
+        "installation": asdict(new.installation),
     }
     layout, sheet = layout_of(marker_id, spec), sheet_of(marker_id, spec)
     check_never_broken(layout, sheet.checks)
@@ -189,7 +190,7 @@ def _planned_tag(commitment: Commitment, marker: PlannedMarker, detail: PlannedT
     lon, lat, along_m = lane_around(commitment.alignment.lane(marker.lane), marker)
     tag = TagIn(code=detail.tag.text, codebook_id=commitment.codebook_id, chainage_m=along_m, offset_m=marker.offset_m)
     lane = _planned_lane(commitment, np.column_stack([lon, lat]).tolist(), marker.height_m)
-    new = MagnetIn(family="magnet", lane=lane, tag=tag)
+    new = MagnetIn(family="magnet", lane=lane, tag=tag, installation=commitment.installation)
     columns = magnet_columns(new, detail.tag, detail.meaning, commitment.rules, commitment.now)
     return PlannedRow(marker.number, columns | commitment.on_road(marker) | {"original": commitment.original(marker)})
 
@@ -201,7 +202,7 @@ def _planned_line(commitment: Commitment, stretch: Sequence[PlannedMarker]) -> P
     spacing_m = spacing_of(LaneLine.from_lon_lat(points, height_m or 0.0))
     style = LineStyle.SOLID if detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
     lane, line = _planned_lane(commitment, points, height_m), LineIn(spacing_m=spacing_m, style=style)
-    new = MagnetIn(family="magnet", lane=lane, line=line)
+    new = MagnetIn(family="magnet", lane=lane, line=line, installation=commitment.installation)
     columns = magnet_columns(new, detail.tag, None, commitment.rules, commitment.now)
     columns |= commitment.on_road(stretch[0]) | {"original": commitment.original(stretch[0])}
     return PlannedRow(stretch[0].number, columns, len(stretch))
@@ -231,7 +232,7 @@ class Magnets(Family[MagnetIn, ColumnValues]):
     schema = MagnetIn
     examples = MAGNET_EXAMPLES
     has_index = True
-    sheet_version = 1
+    sheet_version = 2
     lines = MagnetLines()
     document_type = MagnetDocument
     detail_type = MagnetDetailDocument

@@ -27,6 +27,7 @@ from app.families.documents import (
     MarkerDocument,
     MarkerIn,
     PositionIn,
+    WarningDocument,
     marker_head,
     marker_place,
     place_input,
@@ -53,6 +54,7 @@ from app.geodesy import UNFIT_TEXT, PlacedPosition
 from app.geodesy.frames import distance_m
 from app.inputs import Number, StrictModel, Text, Whole
 from app.markers.plate import (
+    NO_CHECK_TEXT,
     RECOMMENDED_SCHEME,
     PlateCode,
     PlateGeometry,
@@ -163,11 +165,21 @@ class PlateGeometryDocument(TypedDict):
 
 
 class PlateDocument(MarkerDocument):
-    """A plate."""
+    """A plate. `code_warnings` state what its code is not fit for."""
 
     family: Literal["plate"]
     code: PlateCodeDocument
+    code_warnings: list[WarningDocument]
     geometry: PlateGeometryDocument
+
+
+NO_CHECK: WarningDocument = {
+    "field": "code.scheme",
+    "code": "scheme-without-check",
+    "message": f"the scheme {PlateScheme.POSITION} has no check: {NO_CHECK_TEXT} by a vehicle that reads alone",
+    "proposal": f"{PlateScheme.POSITION_ROBUST} or {PlateScheme.ID}",
+}
+"""Of plain positions."""
 
 
 def plate_geometry_document(geometry: PlateGeometry) -> PlateGeometryDocument:
@@ -195,6 +207,7 @@ def plate_document(row: MarkerRow) -> PlateDocument:
             "registry_number": _registry_number(row.digits, n) if row.scheme == "id" else None,
             "digits_match_position": row.digits_match_position,
         },
+        "code_warnings": [] if PlateScheme(row.scheme).has_check else [NO_CHECK],
         "geometry": {
             "n": n,
             "unit_mm": unit_mm,

@@ -35,7 +35,7 @@ from app.values import Floats
 
 def site_costs(rules: PlanRules) -> dict[str, float]:
     """Cost of one site of each family that the rules place, from the agency's unit costs: a tag with its magnets and
-    holes, a pair of CERPMs; days by the rate.
+    their holes or shells, a pair of CERPMs; days by the rate.
 
     Raises
     ------
@@ -48,7 +48,8 @@ def site_costs(rules: PlanRules) -> dict[str, float]:
     if rules.plates is not None:
         costs["plate"] = price["plate"] + each
     if rules.tags is not None:
-        costs["magnet"] = price["tag"] + rules.tags.magnets * (price["magnet"] + price["hole"]) + each
+        fixed_by = "shell" if rules.installation.on_surface else "hole"
+        costs["magnet"] = price["tag"] + rules.tags.magnets * (price["magnet"] + price[fixed_by]) + each
     if rules.cerpm is not None:
         sides = 2 if rules.cerpm.sides == "both" else 1
         costs["cerpm"] = sides * (price["cerpm"] + each)
@@ -473,7 +474,7 @@ class _Optimiser:
 # === The families of rules as the optimiser takes them: costs of the agency, and fixes as the checks predict them.
 
 
-_BY_NUMBER = ("magnet", "hole", "cerpm", "marker")  # units of the costs of markers whose places are not sought
+_BY_NUMBER = ("magnet", "hole", "shell", "cerpm", "marker")  # units of the costs of markers whose places are not sought
 
 
 def optimise_by_prediction(alignment: Alignment, rules: PlanRules) -> OptimisedPlan:
@@ -527,8 +528,9 @@ def plate_fixes(rules: PlanRules, lane: Lane, at: Floats) -> tuple[Floats, Float
 
 def tag_fixes(rules: PlanRules, lane: Lane, at: Floats) -> tuple[Floats, Floats]:
     """Probability of a fix by tags at chainages of a lane, and its error [m]."""
+    assert rules.tags is not None
     terms = rules.predictions
-    rate = tag_fix_share() * tag_rates(lane, at, terms.clearance_m)
+    rate = tag_fix_share() * tag_rates(lane, at, rules.magnet_distance_m, rules.tags.magnets)
     return (1.0 - terms.lost_share) * rate, np.full(len(at), tag_fix_error_m(terms.survey_rmse_m))
 
 

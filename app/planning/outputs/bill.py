@@ -15,7 +15,7 @@ from app.formats.text import TableWriter
 from app.markers.cerpm import LaneSide
 from app.markers.reading import Verdict
 from app.planning.alignment import format_station
-from app.planning.magnet_checks import unit_costs
+from app.planning.magnet_checks import ADHESIVE, unit_costs
 from app.planning.plan import Optimum, Plan, PlanFinding, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
 from app.planning.rules import CostItem
 
@@ -108,12 +108,14 @@ def plan_quantities(plan: Plan) -> dict[str, float | None]:
     counts = plan.counts
     rate = plan.rules.costs.markers_per_day
     wanted = set(plan.rules.road.lanes or [lane.name for lane in plan.alignment.lanes])
+    on_surface = plan.rules.installation.on_surface
     return {
         "plate": counts.get("plate", 0),
         "magnet": magnets,
         "tag": len(tags),
         "cerpm": counts.get("cerpm", 0),
-        "hole": magnets,
+        "hole": 0 if on_surface else magnets,
+        "shell": magnets if on_surface else 0,
         "marker": len(plan.markers),
         "metre_of_lane": round(sum(lane.length_m for lane in plan.alignment.lanes if lane.name in wanted), 3),
         "day": None if rate is None else math.ceil(len(plan.markers) / rate - 1e-9),
@@ -140,6 +142,12 @@ def _materials(plan: Plan, given: set[str]) -> tuple[Material, ...]:
                 counts["magnet", item, ("magnet", "tag", "marker")] += detail.tag.magnet_count
             case _:
                 counts["cerpm", "chip-enabled raised pavement marker", ("cerpm", "marker")] += 1
+    magnets = sum(quantity for (family, *_), quantity in counts.items() if family == "magnet")
+    if magnets and plan.rules.installation.on_surface:
+        counts["magnet", f"protective shell, {plan.rules.installation.height_mm:g} mm high", ("shell", "marker")] = (
+            magnets
+        )
+        counts["magnet", ADHESIVE, ("shell", "marker")] = magnets
     return tuple(
         Material(family, item, quantity, priced_by, not given.isdisjoint(priced_by))
         for (family, item, priced_by), quantity in sorted(counts.items())
@@ -356,6 +364,7 @@ class Section:
     day: int | None  # working day from 1; None without a daily rate
     lane: str
     markers: tuple[PlannedMarker, ...]  # by number
+    on_surface: bool = False  # magnets are glued onto the road
 
     def count(self, family: str) -> int:
         """Markers of a family."""
@@ -373,8 +382,8 @@ class Section:
 
     @property
     def holes(self) -> int:
-        """Holes to drill: one a magnet."""
-        return self.line_magnets + sum(tag.tag.magnet_count for tag in self.tags)
+        """Holes to drill: one a magnet, none for magnets on the surface."""
+        return 0 if self.on_surface else self.line_magnets + sum(tag.tag.magnet_count for tag in self.tags)
 
 
 def plan_schedule(plan: Plan) -> tuple[Section, ...]:
@@ -397,7 +406,7 @@ def plan_schedule(plan: Plan) -> tuple[Section, ...]:
                 day = math.floor(done / rate + 1e-9) + 1
                 end = start + max(math.floor(day * rate + 1e-9) - done, 1)
             part = tuple(markers[start:end])
-            sections.append(Section(len(sections) + 1, day, part[0].lane, part))
+            sections.append(Section(len(sections) + 1, day, part[0].lane, part, plan.rules.installation.on_surface))
             start, done = start + len(part), done + len(part)
     return tuple(sections)
 

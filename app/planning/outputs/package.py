@@ -366,7 +366,15 @@ class Package:
         lon, lat, along_m = lane_around(self.plan.alignment.lane(marker.lane), marker)
         line = LaneLine.from_lon_lat(list(zip(lon.tolist(), lat.tolist(), strict=True)), marker.height_m or 0.0)
         name = f"tag-{marker.number:05d}"
-        layout = place_tag(line, detail.tag, along_m, name=name, offset_m=marker.offset_m, meaning=detail.meaning)
+        layout = place_tag(
+            line,
+            detail.tag,
+            along_m,
+            name=name,
+            offset_m=marker.offset_m,
+            meaning=detail.meaning,
+            installation=self.plan.rules.installation,
+        )
         return self._sheets(layout, marker)
 
     def _line_sheets(self, stretch: Sequence[PlannedMarker]) -> Iterator[tuple[str, bytes]]:
@@ -375,19 +383,22 @@ class Package:
         points = [(marker.lon_deg, marker.lat_deg) for marker in stretch]
         line = LaneLine.from_lon_lat(points, first.height_m or 0.0)
         style = LineStyle.SOLID if first.detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
-        layout = place_line(line, style, name=f"line-{first.number:05d}", spacing_m=spacing_of(line))
+        layout = place_line(
+            line,
+            style,
+            name=f"line-{first.number:05d}",
+            spacing_m=spacing_of(line),
+            installation=self.plan.rules.installation,
+        )
         return self._sheets(layout, first)
 
     def _sheets(self, layout: MagnetLayout, marker: PlannedMarker) -> Iterator[tuple[str, bytes]]:
         lane = self.plan.alignment.lane(marker.lane)
-        site = Site(design_speed_m_s=float(lane.value_at(lane.design_speed_m_s, marker.chainage_m)))
-        sheet = replace(drilling_sheet(layout, site), holes=self._holes)
+        site = Site(
+            design_speed_m_s=float(lane.value_at(lane.design_speed_m_s, marker.chainage_m)),
+            wheel_circumference_m=self.plan.rules.vehicles.wheel_circumference_m,
+        )
+        sheet = drilling_sheet(layout, site)
+        folder = "surface" if layout.installation.on_surface else "drilling"
         for form in (SheetFormat.PDF, SheetFormat.CSV):
-            yield f"drilling/{layout.name}.{form}", write_sheet(sheet, form)
-
-    @property
-    def _holes(self) -> str:
-        """Diameter and depth of the holes, as far as the rules have them."""
-        rules = self.plan.rules.installation
-        sizes = (("diameter", rules.hole_diameter_mm), ("depth", rules.hole_depth_mm))
-        return ", ".join(f"{name} {size:g} mm" for name, size in sizes if size is not None)
+            yield f"{folder}/{layout.name}.{form}", write_sheet(sheet, form)

@@ -290,6 +290,9 @@ def marker_feature(plan: Plan, marker: PlannedMarker) -> JsonObject:
         "height_m": marker.height_m,
         **_details(marker.detail),
     }
+    if marker.family == "magnet":
+        fixed = plan.rules.installation
+        properties |= {"mounting": fixed.mounting.value, "depth_m": round(fixed.depth_m, 4)}
     return {**_feature(_point(marker.lon_deg, marker.lat_deg, height), properties), "id": marker.number}
 
 

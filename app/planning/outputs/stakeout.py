@@ -175,6 +175,7 @@ _Place = tuple[str, PlannedMarker, float, float, float, str, float | None, str, 
 def _places(plan: Plan) -> list[_Place]:
     road = plan.alignment
     lanes = {lane.name: lane for lane in road.lanes}
+    fixed = " SURFACE" if plan.rules.installation.on_surface else ""
     places: list[_Place] = []
     for marker in plan.markers:
         detail = marker.detail
@@ -188,7 +189,7 @@ def _places(plan: Plan) -> list[_Place]:
             case PlannedLineMagnet():
                 way = "UP" if detail.tag.polarity.value == "N" else "DOWN"
                 side = detail.side.name
-                places.append((name, marker, *here, "line", None, f"{side} LINE NORTH POLE {way}", station))
+                places.append((name, marker, *here, "line", None, f"{side} LINE NORTH POLE {way}{fixed}", station))
             case PlannedCerpm():
                 places.append((name, marker, *here, "cerpm", None, f"{detail.number} {detail.side.name}", station))
             case PlannedTag():
@@ -199,7 +200,8 @@ def _places(plan: Plan) -> list[_Place]:
                 bearing = tag_bearing_deg(detail)
                 for k, ((_, lon, lat), polarity) in enumerate(zip(detail.magnets, detail.tag.polarities, strict=True)):
                     pole = (bearing + (0.0 if polarity.value == "N" else 180.0)) % 360.0
-                    text = f"{detail.tag.text} MAGNET {k + 1} NORTH POLE {'FWD' if polarity.value == 'N' else 'BACK'}"
+                    way = "FWD" if polarity.value == "N" else "BACK"
+                    text = f"{detail.tag.text} MAGNET {k + 1} NORTH POLE {way}{fixed}"
                     letter = chr(ord("A") + k)
                     places.append(
                         (f"{name}{letter}", marker, lon, lat, height + float(rise[k]), "tag", pole, text, station)
@@ -487,6 +489,7 @@ def _readme(stakeout: Stakeout) -> bytes:
         f"Stakeout of the plan {stakeout.plan.name}",
         "",
         *warning,
+        *([f"Magnets: {fixed}"] if (fixed := stakeout.plan.rules.installation.text) else []),
         f"Points: {len(stakeout.points)} for {len(stakeout.plan.markers)} markers; magnets of tags are 12A, 12B, ...",
         f"Reference system: {stakeout.crs} ({stakeout.crs_name})",
         f"Unit of coordinates and heights: {stakeout.unit} ({METRES[stakeout.unit]:.12g} m)",

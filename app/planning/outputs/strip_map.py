@@ -261,13 +261,8 @@ def _draw_facts(sheet: Sheet, plan: Plan, strips: Sequence[Strip]) -> None:
         ),
         ("Strips", f"{len(strips)} at 1 : {strips[0].scale}" if strips else "0"),
     ]
-    hole = plan.rules.installation
-    if hole.hole_diameter_mm is not None or hole.hole_depth_mm is not None:
-        sizes = [
-            f"diameter {hole.hole_diameter_mm:g} mm" if hole.hole_diameter_mm else "",
-            f"depth {hole.hole_depth_mm:g} mm" if hole.hole_depth_mm else "",
-        ]
-        rows.append(("Holes for magnets", ", ".join(size for size in sizes if size)))
+    if plan.rules.installation.text and "magnet" in plan.counts:
+        rows.append(("Magnets", plan.rules.installation.text))
     for label, value in rows:
         sheet.text(x, y, label, 7, colour=GREY)
         sheet.text(x + 34, y, value, 7.5, width=right - x - 34)

@@ -22,6 +22,7 @@ from app.markers.magnet import InformationTag, LineTag, Polarity
 from app.markers.magnet_design import Codebook, Meaning, TagDesign
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.planning.alignment import Alignment, Lane
+from app.planning.magnet_checks import served_distance_m, vehicle_clearances
 from app.planning.placement.sites import AvoidedAreas, Boundaries, Site, place_line_magnets, place_plates, place_tags
 from app.planning.plan import (
     Detail,
@@ -42,6 +43,8 @@ from app.values import Floats
 
 NumberSource = Callable[[int], Sequence[int]]
 """Returns as many unused registry numbers as are asked for, each only once."""
+MAX_SPEED_M_S = 70.0
+"""Highest speed of a codebook's conditions. [m/s] Source: `ReadingConditions`."""
 _NUMBERS = 2**32  # source: four bytes of a CERPM's message and eight data symbols of an id plate
 
 
@@ -75,9 +78,14 @@ def plate_codes(
 
 
 def tag_codes(
-    rules: TagRules, meanings: Sequence[Meaning], book: Codebook | None, name: str
+    rules: TagRules, meanings: Sequence[Meaning], book: Codebook | None, name: str, reading: CodebookRules
 ) -> tuple[Codebook, dict[Meaning, InformationTag]]:
     """A codebook with all meanings, and the tag of each; codes that the book has stay as they are.
+
+    Parameters
+    ----------
+    reading : CodebookRules
+        Conditions in which the codes must be read, as `tag_conditions` has them.
 
     Raises
     ------
@@ -97,15 +105,30 @@ def tag_codes(
     known = {meaning for _tag, meaning in book.entries}
     new = [meaning for meaning in dict.fromkeys(meanings) if meaning not in known]
     try:
-        book = allocate_codes(book, new, CodebookRules())
+        book = allocate_codes(book, new, reading)
     except CodebookFull as error:
         raise InvalidParameter(
             f"the tags of the plan have {len(known | set(meanings))} meanings: {error.message}",
             field="tags.magnets",
             limit=error.limit,
-            cure="use more magnets or a longer tag, or announce fewer kinds of events",
+            cure="use more magnets or a longer tag (tags.size: freeway), or announce fewer kinds of events",
         ) from error
     return book, {meaning: tag for tag, meaning in book.entries}
+
+
+def tag_conditions(rules: PlanRules, alignment: Alignment) -> CodebookRules:
+    """Conditions in which the codes of tags must be read: highest design speed, and largest distance to the magnets.
+
+    Not below those of METRO's tests, 30 mph and 30 cm. The distance is that of the kind of vehicle to be served, and of
+    the predictions.
+    """
+    usual = CodebookRules()
+    distance_m = usual.clearance_m + max(rules.installation.depth_m, 0.0)
+    if rules.tags is not None and rules.tags.clearance_class in vehicle_clearances():
+        distance_m = max(distance_m, served_distance_m(rules.tags.clearance_class, rules.installation))
+    lanes = _chosen_lanes(alignment, rules)
+    speed_m_s = max(usual.speed_m_s, *(float(lane.design_speed_m_s.max()) for lane in lanes))
+    return replace(usual, speed_m_s=min(speed_m_s, MAX_SPEED_M_S), clearance_m=max(distance_m, rules.magnet_distance_m))
 
 
 # === Places of CERPMs on the boundaries of a lane: by the cycle of the markings, closer where the path asks for it.
@@ -379,7 +402,8 @@ class _Placer:
             plates = place_plates(self.alignment, lane, rules, tag_ranges, chosen_m)
             self._add_plates(lane, self._clear(lane, "plate", *plates))
         if rules.lines is not None:
-            lines = self._clear(lane, "magnet", place_line_magnets(lane, rules.lines, self._painted))
+            circumference_m = rules.vehicles.wheel_circumference_m
+            lines = self._clear(lane, "magnet", place_line_magnets(lane, rules.lines, self._painted, circumference_m))
             self._add_line_magnets(lane, lines)
         if rules.cerpm is not None:
             cerpms = beside_magnets(lane, self._cerpm_sites(lane, rules), lines)
@@ -391,7 +415,8 @@ class _Placer:
         """All markers by lane and chainage, numbered, and the codebook of the tags."""
         meanings = [site.meaning for _, sites in self._tags for site in sites if site.meaning is not None]
         if self.rules.tags is not None and meanings:
-            codebook, codes = tag_codes(self.rules.tags, meanings, codebook, name)
+            reading = tag_conditions(self.rules, self.alignment)
+            codebook, codes = tag_codes(self.rules.tags, meanings, codebook, name, reading)
             for lane, sites in self._tags:
                 details = [_planned_tag(lane, site, codes) for site in sites]
                 self._add(lane, "magnet", sites, details, [detail.tag.text for detail in details])

@@ -18,6 +18,7 @@ from app.markers.cerpm import LaneSide
 from app.markers.magnet import MIN_GAP_M
 from app.markers.magnet_design import Meaning, MeaningKind
 from app.planning.alignment import Alignment, Lane, RoadEvent
+from app.planning.magnet_checks import turn_margin_m
 from app.planning.plan import LeftOut, Purpose
 from app.planning.rules import Ahead, AvoidRules, LineRules, PlanRules, PlateRules, TagRules
 from app.values import Floats
@@ -92,9 +93,15 @@ class Stretch(NamedTuple):
         """Along the boundary, which is longer than the lane outside of bends. [m]"""
         return float(self.along_m[self.last] - self.along_m[self.first])
 
-    def chainages_m(self, spacing_m: float) -> Floats:
-        """Chainages of the fewest points at even distances along the boundary, both ends among them, shape (K,). [m]"""
-        count = max(int(np.ceil(self.length_m / spacing_m - 1e-9)) + 1, 2)
+    def chainages_m(self, spacing_m: float, circumference_m: tuple[float, float]) -> Floats:
+        """Chainages of the fewest points at even distances along the boundary, both ends among them, shape (K,). [m]
+
+        The points are no half, one or two turns of the vehicles' wheels apart, where any distance is left.
+        """
+        fewest = max(int(np.ceil(self.length_m / spacing_m - 1e-9)), 1)
+        steps = range(fewest, max(int(self.length_m / MIN_GAP_M), fewest) + 1)
+        free = (n for n in steps if turn_margin_m(self.length_m / n, circumference_m) >= 0)
+        count = next(free, fewest) + 1
         at = self.along_m[self.first] + np.linspace(0.0, self.length_m, count)
         part = slice(self.first, self.last + 1)
         return np.asarray(np.interp(at, self.along_m[part], self.lane.chainage_m[part]))
@@ -213,8 +220,12 @@ def _with_clearance(ring_deg: Floats, clearance_m: float) -> shapely.Geometry:
 # === Places of line magnets along painted lines; a line between two lanes is placed once.
 
 
-def place_line_magnets(lane: Lane, rules: LineRules, painted: Boundaries) -> list[Site]:
+def place_line_magnets(
+    lane: Lane, rules: LineRules, painted: Boundaries, circumference_m: tuple[float, float]
+) -> list[Site]:
     """Magnets of a lane's painted lines that no lane before it has, at even distances along each line.
+
+    They do not repeat with the turns of wheels of these circumferences.
 
     A line of unknown style counts as solid; `check_plan` says so.
     """
@@ -226,7 +237,7 @@ def place_line_magnets(lane: Lane, rules: LineRules, painted: Boundaries) -> lis
         for stretch in painted.add(lane, side, rules.offset_m):
             if stretch.length_m < rules.max_spacing_m / 2:
                 continue
-            chainages = stretch.chainages_m(rules.max_spacing_m)
+            chainages = stretch.chainages_m(rules.max_spacing_m, circumference_m)
             offsets = lane.value_at(stretch.offset_m, chainages)
             sites += [
                 Site(chainage, offset, Purpose.PAINTED_LINE, side=side, style=style)

@@ -43,16 +43,17 @@ def check_predictions(plan: Plan) -> Iterator[PlanFinding]:
     """One finding for each camera and condition, for tags, for line magnets, and for the path."""
     yield from _plates(plan)
     terms = plan.rules.predictions
-    clearance = terms.clearance_m
+    distance_m, magnets = plan.rules.magnet_distance_m, plan.rules.tags.magnets if plan.rules.tags else 0
+    deep = f"{terms.clearance_m:g} m, {distance_m:.3f} m above the magnets"
     for kind, what, rate_of in (
-        (PlannedTag, "tags", lambda lane, at: tag_rates(lane, at, clearance)),
-        (PlannedLineMagnet, "line", lambda lane, at: line_rates(lane, at, clearance)),
+        (PlannedTag, "tags", lambda lane, at: tag_rates(lane, at, distance_m, magnets)),
+        (PlannedLineMagnet, "line", lambda lane, at: line_rates(lane, at, distance_m)),
     ):
         markers = [marker for marker in plan.markers if isinstance(marker.detail, kind)]
         if markers:
             sentence = f"of {what if what == 'tags' else 'magnets of a line under the bar'} at a clearance of "
             yield _rate(plan, f"predicted-read-rate {what}", markers, _by_lane(plan, markers, rate_of),
-                        f"{sentence}{clearance:g} m")  # fmt: skip
+                        f"{sentence}{deep}")  # fmt: skip
     yield from _path(plan)
 
 

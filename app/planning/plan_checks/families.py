@@ -14,12 +14,24 @@ import scipy
 
 from app.encoders.magnet.codebook import CodebookRules, codebook_capacity, list_conflicts
 from app.geodesy.frames import ecef_from_wgs84
-from app.markers.magnet import MAX_LINE_SPACING_M, MIN_GAP_M
-from app.markers.plate import PlateGeometry, PlateScheme, plate_capacity
+from app.markers.magnet import MAX_LINE_SPACING_M, MIN_GAP_M, Orientation
+from app.markers.magnet_design import TagDesign, covariance_of, placements_of, separation_for
+from app.markers.plate import NO_CHECK_TEXT, PlateGeometry, PlateScheme, plate_capacity
 from app.markers.reading import Verdict
 from app.planning.alignment import Lane
-from app.planning.magnet_checks import HALF_BAR_M, READABLE_CLEARANCE_M, vehicle_clearances
-from app.planning.placement.place import path_error_m
+from app.planning.magnet_checks import (
+    HALF_BAR_M,
+    MAX_SHELL_MM,
+    RECALL_SOURCE,
+    SHELL_NOTE,
+    magnet_recall,
+    served_distance_m,
+    served_sentence,
+    turn_cure,
+    turn_margin_m,
+    vehicle_clearances,
+)
+from app.planning.placement.place import path_error_m, tag_conditions
 from app.planning.placement.sites import distance_ahead_m
 from app.planning.plan import (
     Plan,
@@ -251,9 +263,6 @@ def _busiest(cerpms: Sequence[PlannedMarker], air: Air) -> tuple[RoadMarkers, Pl
 # === Magnets: spacing, vehicles served by clearance, codes that stay distinguishable, and the distance to events.
 
 
-_SERVED = (
-    0.95  # share of a kind of vehicle that must have a readable clearance; source: as app/planning/magnet_checks.py
-)
 _COUNTED = 2_000  # codes of a codebook that are counted; bounds the time
 
 
@@ -262,32 +271,51 @@ def check_magnets(plan: Plan) -> Iterator[PlanFinding]:
     lines = [marker for marker in plan.markers if isinstance(marker.detail, PlannedLineMagnet)]
     tags = [marker for marker in plan.markers if isinstance(marker.detail, PlannedTag)]
     if lines:
-        yield from _line_spacing(lines)
+        yield from _line_spacing(plan, lines)
         yield from _unknown_styles(plan)
+        yield _clearance(plan, "line", Orientation.UP)
     if tags:
         assert plan.rules.tags is not None
-        yield _clearance(plan.rules.tags)
+        yield _clearance(plan, "tags", Orientation.FORWARD)
         yield from _codebook(plan)
         yield _reaction(plan, tags, plan.rules.tags)
     if lines or tags:
         yield _neighbours(lines, tags)
+        if plan.rules.installation.on_surface:
+            yield compare(
+                "shell-height", plan.rules.installation.height_mm, "<=", MAX_SHELL_MM, "mm",
+                "MUTCD (2009), section 3B.11", SHELL_NOTE, missed=Verdict.WARN,
+            )  # fmt: skip
 
 
-def _line_spacing(lines: list[PlannedMarker]) -> Iterator[PlanFinding]:
-    """Farthest neighbours of the same line; gaps around avoided areas included."""
+def _line_spacing(plan: Plan, lines: list[PlannedMarker]) -> Iterator[PlanFinding]:
+    """Farthest neighbours of the same line, gaps around avoided areas included; spacings that repeat with wheels."""
     by_line: dict[tuple[str, int], list[PlannedMarker]] = defaultdict(list)
     for marker in lines:
         assert isinstance(marker.detail, PlannedLineMagnet)
         by_line[marker.lane, marker.detail.side].append(marker)
     worst, farthest = lines[0], 0.0
+    circumference_m = plan.rules.vehicles.wheel_circumference_m
+    repeating: list[tuple[float, PlannedMarker]] = []
     for line in by_line.values():
         points = _ecef(line)
         apart = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        if len(apart) and turn_margin_m(float(np.median(apart)), circumference_m) < 0:
+            repeating.append((float(np.median(apart)), line[0]))
         if len(apart) and float(apart.max()) > farthest:
             farthest, worst = float(apart.max()), line[int(apart.argmax())]
     yield compare(
         "line-spacing", farthest, "<=", MAX_LINE_SPACING_M + 0.005, "m", "METRO section 6.3",
         "farthest neighbours of a painted line", worst, missed=Verdict.WARN,
+    )  # fmt: skip
+    low, high = circumference_m
+    sentence = f"lines whose magnets are half, one or two turns of a wheel of {low:g} to {high:g} m apart"
+    if repeating:
+        cure = turn_cure(circumference_m).replace("choose", "choose lines.max_spacing_m of")
+        sentence += f", as the wheel's own field: {repeating[0][0]:.2f} m; {cure}"
+    yield compare(
+        "wheel-turns", len(repeating), "<=", 0, "lines", "docs/benchmarks.md: lines of magnets", sentence,
+        repeating[0][1] if repeating else None, missed=Verdict.WARN,
     )  # fmt: skip
 
 
@@ -305,36 +333,60 @@ def _unknown_styles(plan: Plan) -> Iterator[PlanFinding]:
         )  # fmt: skip
 
 
-def _clearance(rules: TagRules) -> PlanFinding:
-    known = vehicle_clearances()
-    name = rules.clearance_class
-    if name not in known:
-        return compare(
-            "clearance", 0, ">=", 1, "classes", "METRO figure 14a", f"{name[:40]!r} is none of {', '.join(known)}"
-        )
-    mean_m, std_m = known[name]
-    served = float(scipy.special.ndtr((READABLE_CLEARANCE_M - mean_m) / std_m))
+def _clearance(plan: Plan, what: str, orientation: Orientation) -> PlanFinding:
+    """Distance from the sensors to the magnets, for most of the kind of vehicle to be served."""
+    rules = plan.rules
+    kind = rules.tags.clearance_class if rules.tags is not None else TagRules().clearance_class
+    name = f"clearance {kind}" + (f" {what}" if what != "tags" else "")
+    if kind not in vehicle_clearances():
+        known = ", ".join(vehicle_clearances())
+        return compare("clearance", 0, ">=", 1, "classes", "METRO figure 14a", f"{kind[:40]!r} is none of {known}")
+    readable_m = magnet_recall(orientation).proven_m
+    distance_m = served_distance_m(kind, rules.installation)
+    sentence = f"{what}: {served_sentence(kind, rules.installation, readable_m)}"
+    if distance_m > readable_m:
+        sentence += "; choose a smaller installation.hole_depth_mm, or installation.mounting: surface"
     return compare(
-        f"clearance {name}", mean_m + float(scipy.special.ndtri(_SERVED)) * std_m, "<=", READABLE_CLEARANCE_M, "m",
-        "METRO figure 14a, section 7.3", f"{_SERVED:.0%} have less ground clearance; {served:.0%} can read the tags",
-        missed=Verdict.WARN,
-    )  # fmt: skip
+        name, distance_m, "<=", readable_m, "m", f"METRO figure 14a; {RECALL_SOURCE}", sentence, missed=Verdict.WARN
+    )
 
 
 def _codebook(plan: Plan) -> Iterator[PlanFinding]:
     book = plan.codebook
     assert book is not None
+    reading = tag_conditions(plan.rules, plan.alignment)
+    at = f"at {reading.speed_m_s * 3.6:.0f} km/h, {100 * reading.clearance_m:.0f} cm above the magnets"
     used = len(book.entries)
-    capacity = max(codebook_capacity(book.design, CodebookRules(), max_count=_COUNTED), used)
+    capacity = max(codebook_capacity(book.design, reading, max_count=_COUNTED), used)
     least = "at least " if capacity == _COUNTED else ""
     yield compare(
         "codebook-room", used / capacity, "<=", 1.0, "share", "METRO equation 2 and figure 17",
-        f"{used} of {least}{capacity} codes that stay distinguishable are used",
+        f"{used} of {least}{capacity} codes that stay distinguishable {at} are used",
     )  # fmt: skip
-    near = list_conflicts(book, CodebookRules())
+    near = list_conflicts(book, reading)
     yield compare(
         "distinguishable-codes", len(near), "<=", 0, "pairs", "docs/magnets.md: confused once in 1,000 readings",
-        "pairs of codes that are nearer to each other than the decoder's error allows",
+        f"pairs of codes that are nearer to each other than the decoder's error allows {at}",
+    )  # fmt: skip
+    if book.design.magnets > 2:
+        yield _resolution(book.design, reading, at)
+
+
+def _resolution(design: TagDesign, reading: CodebookRules, at: str) -> PlanFinding:
+    """The grid of a tag's middle magnets, against how far one must move to be another code.
+
+    A longer tag with longer segments is for higher speeds, at which the bar has fewer samples of each magnet, and for
+    larger distances (METRO section 10).
+    """
+    covariance = covariance_of(placements_of(design).astype(np.float64) * design.segment_m, reading.conditions)
+    std_m = design.length_m * math.sqrt(float(np.diagonal(covariance, axis1=1, axis2=2).max()))
+    needed_m = separation_for(reading.confusion) * std_m
+    sentence = f"segments of tags, against the least move of a magnet that is read as another code {at}"
+    if design.segment_m < needed_m:
+        sentence += "; some codes are left out: longer tags with longer segments keep all (tags.size: freeway)"
+    return compare(
+        "tag-resolution", design.segment_m, ">=", needed_m, "m", "METRO sections 4.2 and 10; docs/plans.md", sentence,
+        missed=Verdict.WARN,
     )  # fmt: skip
 
 
@@ -443,6 +495,7 @@ def check_plates(plan: Plan) -> Iterator[PlanFinding]:
         if camera.rolling_shutter_s > 0:
             yield _rolling_shutter(plan, plates, camera)
     yield _room(plates, rules)
+    yield _alone(plan, plates, rules)
 
 
 def _frames(plan: Plan, plates: Sequence[PlannedMarker], camera: CameraRules, rules: PlateRules) -> PlanFinding:
@@ -496,6 +549,19 @@ def _room(plates: Sequence[PlannedMarker], rules: PlateRules) -> PlanFinding:
         return compare("plate-scheme", used, "<=", 0.5, "share", "PlateScheme.ID: Reed-Solomon over GF(16)", sentence)
     sentence = f"{len(plates) - codes} plates have the same digits as another plate of the plan"
     return compare("plate-scheme", len(plates) - codes, "<=", 0, "plates", "PolyU section II.A", sentence)
+
+
+def _alone(plan: Plan, plates: Sequence[PlannedMarker], rules: PlateRules) -> PlanFinding:
+    """Plates whose digits nothing confirms, where vehicles read them without the registry."""
+    count = 0 if rules.scheme.has_check or not plan.rules.vehicles.read_alone else len(plates)
+    sentence = "plates of a scheme without a check, for vehicles that read alone"
+    if count:
+        sentence += f": {NO_CHECK_TEXT}; choose plates.scheme: {PlateScheme.POSITION_ROBUST} or {PlateScheme.ID}, or "
+        sentence += "vehicles.read_alone: false if all vehicles know the registered plates"
+    return compare(
+        "plate-check", count, "<=", 0, "plates", "docs/artwork.md", sentence, plates[0] if count else None,
+        missed=Verdict.WARN,
+    )  # fmt: skip
 
 
 def _speed_m_s(plan: Plan, marker: PlannedMarker) -> float:

@@ -16,8 +16,10 @@ import numpy.typing as npt
 import scipy
 
 from app.errors import InvalidParameter
+from app.markers.magnet import Orientation
 from app.markers.plate import PlateGeometry
 from app.planning.alignment import Lane
+from app.planning.magnet_checks import magnet_recall
 from app.planning.placement.place import one_of_each_pair, path_error_m
 from app.planning.plate_view import camera_of, project_road, unit_heights_px
 from app.planning.rules import CameraRules, PredictionRules
@@ -70,11 +72,11 @@ class PlateModel:
 
 @dataclass(frozen=True, slots=True)
 class MagnetModel:
-    """Read rate of a tag or of a line's magnet: log-odds linear in clearance and curvature."""
+    """Read rate of a tag or of a line's magnet: what bends and neighbours leave, times that of magnets by distance."""
 
-    # `at_16_cm`, `per_metre`, `per_curvature`: [m] Log-odds at a clearance of 0.16 m, and by how much they change with
-    # clearance [1/m] and curvature
-    at_16_cm: float
+    # `straight`, `per_metre`, `per_curvature`: log-odds on a straight road 0.16 m above the magnets, and by how much
+    # they change with the distance, as neighbours merge, and with curvature. [1, 1/m, m]
+    straight: float
     per_metre: float
     per_curvature: float
     # `fix_share`, `fix_rms_m`: share of read tags that fix the position, and its error with an exact survey,
@@ -82,12 +84,23 @@ class MagnetModel:
     fix_share: float = 0.0
     fix_rms_m: float = 0.0
 
-    def read_rate(self, clearance_m: float, curvature_per_m: npt.ArrayLike) -> Floats:
-        """Of the shape of the curvatures."""
+    def read_rate(
+        self, distance_m: float, curvature_per_m: npt.ArrayLike, orientation: Orientation, magnets: int = 1
+    ) -> Floats:
+        """Of the shape of the curvatures.
+
+        Parameters
+        ----------
+        distance_m : float
+            From the sensors down to the magnets: clearance and depth. [m]
+        magnets : int
+            Of the tag, each of which must be read.
+        """
         bend = np.abs(np.asarray(curvature_per_m, dtype=np.float64))
-        return np.asarray(
-            scipy.special.expit(self.at_16_cm + self.per_metre * (clearance_m - 0.16) + self.per_curvature * bend)
+        near = np.asarray(
+            scipy.special.expit(self.straight + self.per_metre * (distance_m - 0.16) + self.per_curvature * bend)
         )
+        return near * magnet_recall(orientation).share_at(distance_m) ** magnets
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,16 +278,22 @@ def tag_fix_share() -> float:
     return fitted_models().tags.fix_share
 
 
-def tag_rates(lane: Lane, chainages_m: npt.ArrayLike, clearance_m: float) -> Floats:
-    """Probability that a pass reads each tag that is there, shape (K,)."""
+def tag_rates(lane: Lane, chainages_m: npt.ArrayLike, distance_m: float, magnets: int) -> Floats:
+    """Probability that a pass reads each tag that is there, shape (K,), of so many magnets at a distance below."""
     at = np.asarray(chainages_m, dtype=np.float64)
-    return fitted_models().tags.read_rate(clearance_m, lane.value_at(lane.curvature_per_m, at))
+    bend = lane.value_at(lane.curvature_per_m, at)
+    return fitted_models().tags.read_rate(distance_m, bend, Orientation.FORWARD, magnets)
 
 
-def line_rates(lane: Lane, chainages_m: npt.ArrayLike, clearance_m: float) -> Floats:
-    """Probability that a vehicle with its bar over a line reads each of its magnets, shape (K,)."""
+def tag_rate(distance_m: float, magnets: int) -> float:
+    """Probability that a bar on a straight road reads a tag of so many magnets at a distance below."""
+    return float(fitted_models().tags.read_rate(distance_m, 0.0, Orientation.FORWARD, magnets))
+
+
+def line_rates(lane: Lane, chainages_m: npt.ArrayLike, distance_m: float) -> Floats:
+    """Probability that a vehicle with its bar over a line reads each of its magnets, shape (K,), that far below."""
     at = np.asarray(chainages_m, dtype=np.float64)
-    return fitted_models().lines.read_rate(clearance_m, lane.value_at(lane.curvature_per_m, at))
+    return fitted_models().lines.read_rate(distance_m, lane.value_at(lane.curvature_per_m, at), Orientation.UP)
 
 
 class Stretches(NamedTuple):

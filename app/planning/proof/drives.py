@@ -45,7 +45,7 @@ from app.geodesy import (
 )
 from app.lanes.types import Lane as LaneEstimate
 from app.markers.cerpm import CerpmMessage, LaneSide, derive_marker_key
-from app.markers.magnet import Orientation
+from app.markers.magnet import HALF_HEIGHT_M, Orientation
 from app.markers.reading import MarkerRow
 from app.planning.alignment import Lane
 from app.planning.plan import PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedTag
@@ -303,6 +303,7 @@ class MagnetPass:
     speed_m_s: float
     clearance_m: float
     seed: tuple[int, ...]
+    depth_m: float = -HALF_HEIGHT_M  # [m] of the magnets' centres below the road
     bends: bool = True
 
     def scene(self) -> Scene:
@@ -313,18 +314,19 @@ class MagnetPass:
         road = Road(length_m, _bends(self.lane, start_m, length_m) if self.bends else (), heading_deg=heading_deg)
         tags = []
         if self.tag is not None:
-            tags = [PlacedTag(_planned_tag(self.tag).tag, self.tag.chainage_m - start_m, self.tag.offset_m)]
+            tags = [self._placed(self.tag, start_m)]
         lines = [
-            RoadMagnet(at - start_m, left, _line(marker).tag.polarity, Orientation.UP, marker.number)
+            RoadMagnet(at - start_m, left, _line(marker).tag.polarity, Orientation.UP, marker.number, self.depth_m)
             for marker, at, left in self.lines
         ]
         others = [marker for marker in self.nearby if marker is not self.tag and marker.lane == self.lane.name]
-        beside = [
-            PlacedTag(_planned_tag(marker).tag, marker.chainage_m - start_m, marker.offset_m) for marker in others
-        ]
+        beside = [self._placed(marker, start_m) for marker in others]
         lines += [replace(magnet, tag=_OTHER) for magnet in tag_magnets(beside) if 0 < magnet.chainage_m < length_m]
         course = Course(speed_m_s=self.speed_m_s, left_m=self.left_m, weave_m=_WEAVE_M)
         return Scene(road, Vehicle.compact(clearance_m=self.clearance_m), course, tags=tags, lines=lines)
+
+    def _placed(self, marker: PlannedMarker, start_m: float) -> PlacedTag:
+        return PlacedTag(_planned_tag(marker).tag, marker.chainage_m - start_m, marker.offset_m, self.depth_m)
 
 
 def drive_tag(one: MagnetPass, weight: float) -> tuple[MarkerPass, list[WrongReading]]:
@@ -381,7 +383,9 @@ def decode_upload(one: MagnetPass, simulated: SimulatedDrive) -> ReadTrace:
     with pack(write_tables(simulated.trace)).open() as stream:
         trace = read_trace({"drive.zip": stream}, declared).trace
     nearby = NearbyTags.of(one.rows, EPOCH)
-    findings, _version = find_magnets(trace, declared, nearby.texts, () if nearby.texts else one.formats)
+    findings, _version = find_magnets(
+        trace, declared, nearby.texts, () if nearby.texts else one.formats, nearby.depth_m
+    )
     return nearby.match(findings, declared.sensors)
 
 
@@ -412,6 +416,7 @@ def _tag_cause(one: MagnetPass) -> str:
         ("bend", replace(one, bends=False)),
         ("speed", slower),
         ("clearance", replace(one, clearance_m=min(one.clearance_m, 0.16))),
+        ("depth", replace(one, depth_m=-HALF_HEIGHT_M)),
     )
     for cause, easier in tries:
         if read_tag(easier)[0]:

@@ -367,6 +367,7 @@ class Prover:
             speed_m_s=self._speed_m_s(lane, (low + high) / 2),
             clearance_m=self.terms.clearance_m,
             seed=seed,
+            depth_m=self.plan.rules.installation.depth_m,
         )
 
     def _magnet_rows(self, position: CoarsePosition, drive: int) -> list[MarkerRow]:

@@ -63,7 +63,9 @@ class ProofTerms(BaseModel):
     )
     speed_share: Number = Field(default=1.0, ge=0.1, le=1.5, description="Of the design speed.")
     lost_share: Number = Field(default=0.0, ge=0.0, le=0.9, description="Of the markers, missing in a drive.")
-    clearance_m: Number = Field(default=0.16, ge=0.05, le=0.6, description="Of the magnetometers above the road.")
+    clearance_m: Number = Field(
+        default=0.16, ge=0.05, le=0.6, description="Of the magnetometers above the road; the magnets may lie deeper."
+    )
     survey_rmse_m: Number = Field(default=0.03, ge=0.0, le=2.0, description="Of the registered positions, horizontal.")
     max_markers_per_drive: Whole = Field(
         default=40, ge=1, le=1_000_000, description="Plates and tags each; more are sampled by strata."

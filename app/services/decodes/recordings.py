@@ -149,6 +149,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
             nearby.texts,
             formats,
             self._rules.traces,
+            nearby.depth_m,
             wait_s=upload.wait_s,
         )
         return PendingSignal(pending, partial(TraceSignal, nearby))

@@ -15,13 +15,13 @@ from typing_extensions import TypedDict
 from app.decoders.magnet.identify import TagCandidates, TagFormat
 from app.decoders.magnet.readings import Finding
 from app.decoding.declarations import DeclaredTrace
-from app.decoding.recordings import find_magnets
+from app.decoding.recordings import bar_above, find_magnets
 from app.errors import InvalidParameter
 from app.formats.format import SpooledFile
 from app.formats.traces.declaration import TraceLimits, TraceReport
 from app.formats.traces.parts import NEAR_S
 from app.formats.traces.read import read_trace
-from app.markers.magnet import MOMENT_AM2, InformationTag, Orientation, parse_tag
+from app.markers.magnet import HALF_HEIGHT_M, MOMENT_AM2, InformationTag, Orientation, parse_tag
 from app.plots.trace import largest_change, plot_trace
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 from app.services.decoder_tasks import decoder_task
@@ -66,6 +66,7 @@ def decode_recording(
     tags: tuple[str, ...] = (),
     formats: tuple[TagFormat, ...] = (),
     limits: TraceLimits = TraceLimits(),
+    depth_m: float | None = -HALF_HEIGHT_M,
 ) -> DecodedTrace:
     """Read the files of a recording and decode their trace.
 
@@ -79,6 +80,8 @@ def decode_recording(
         Texts of the information tags that are registered nearby.
     formats : tuple of TagFormat
         Used where there are none.
+    depth_m : float, optional
+        Of the magnets that are registered nearby, below the road; None where they differ. [m]
     """
     from app.decoders.magnet.recording_check import find_mistakes
 
@@ -87,9 +90,10 @@ def decode_recording(
         content = read_trace({name: stream}, declared, limits)
     loaded = time.perf_counter()
     trace, report = content.trace, content.report
-    findings, version = find_magnets(trace, declared, tags, formats)
+    findings, version = find_magnets(trace, declared, tags, formats, depth_m)
     if declared.method == "matched":
-        for mistake in find_mistakes(trace, declared.sensors, findings):
+        bar = bar_above(declared.sensors, depth_m)
+        for mistake in find_mistakes(trace, bar, findings, depth_m=depth_m or 0.0):
             report.warn(mistake.text)
     report.load_ms, report.decode_ms = 1e3 * (loaded - began), 1e3 * (time.perf_counter() - loaded)
     speed = np.interp(trace.t_s, trace.speed_t_s, trace.speed_m_s)

@@ -25,7 +25,7 @@ from app.lanes.smooth_line import lengths_along, mean_fixes, plane_from_wgs84, w
 from app.lanes.types import Lane
 from app.markers.cerpm import LaneSide
 from app.markers.reading import MarkerRow, horizontal_rmse_m
-from app.planning.predict.rates import fitted_models
+from app.planning.predict.rates import tag_rate
 from app.registry.decodes import NewObservation
 from app.registry.markers import list_near
 from app.registry.spatial import distances_m
@@ -370,7 +370,9 @@ def missed_tags(
         for tag in nearby:
             if tag.marker_id in read or tag.marker_id in doubtful or tag.status not in _ON_ROAD:
                 continue
-            expected = _passed_probability(first.fix, second.fix, gap_m, tag, bar)
+            clearance_m = _distance_m(first.reading) - _registered(first).depth_m
+            rate = tag_rate(clearance_m + tag.depth_m, tag.tag.magnet_count)
+            expected = rate * _inside_probability(first.fix, second.fix, gap_m, tag, bar)
             if expected > 0.0 and tag.marker_id not in rows:
                 along = 0.5 * (first.reading.start_s + second.reading.start_s)
                 evidence = rounded({**_about_tag(tag), "expected": expected, "along": along})
@@ -466,9 +468,13 @@ def _evidence(tag: ReadTag, along: tuple[float, float] | None) -> dict[str, obje
 
 
 def _read_rate(reading: TagReading) -> float:
-    """That a tag is read which the bar passes: the decoder's rate by clearance (app/planning/data/predictions.json)."""
-    clearance_m = float(np.median([magnet.clearance_cm for magnet in reading.magnets])) / 100.0
-    return float(fitted_models().tags.read_rate(clearance_m, 0.0))
+    """That a tag is read which the bar passes: the decoder's rate by distance (app/planning/predict/rates.py)."""
+    return tag_rate(_distance_m(reading), len(reading.magnets))
+
+
+def _distance_m(reading: TagReading) -> float:
+    """From the bar down to the magnets. [m]"""
+    return float(np.median([magnet.clearance_cm for magnet in reading.magnets])) / 100.0
 
 
 def _along_offsets(tags: Sequence[ReadTag]) -> list[tuple[float, float] | None]:
@@ -513,8 +519,8 @@ def _odometer(tag: ReadTag) -> float:
     return 0.5 * (tag.reading.magnets[0].odometer_m + tag.reading.magnets[-1].odometer_m)
 
 
-def _passed_probability(first: TagFix, second: TagFix, gap_m: float, tag: RegisteredTag, bar: MagnetometerBar) -> float:
-    """That a healthy tag between two fixes is read: that it lies within the bar, times the decoder's rate; 0 elsewhere.
+def _inside_probability(first: TagFix, second: TagFix, gap_m: float, tag: RegisteredTag, bar: MagnetometerBar) -> float:
+    """That a tag between two fixes lies within the bar; 0 elsewhere.
 
     The path is the cubic curve through both positions in both headings (Hermite).
     """
@@ -538,9 +544,7 @@ def _passed_probability(first: TagFix, second: TagFix, gap_m: float, tag: Regist
     array = bar.positions_m[bar.array][:, 1]
     low, high = float(array.min()), float(array.max())
     sigma_m = WANDER_M + WANDER_PER_M * min(gap_m, chord_m)
-    inside = float(scipy.stats.norm.cdf((high - aside_m) / sigma_m) - scipy.stats.norm.cdf((low - aside_m) / sigma_m))
-    rate = float(fitted_models().tags.read_rate(0.16, 0.0))
-    return inside * rate
+    return float(scipy.stats.norm.cdf((high - aside_m) / sigma_m) - scipy.stats.norm.cdf((low - aside_m) / sigma_m))
 
 
 def _direction(heading_deg: float) -> npt.NDArray[np.float64]:

@@ -200,7 +200,7 @@ def _result(
         "id": marker["id"],
         "version": marker["version"],
         "problem": None,
-        "warnings": marker.get("position_warnings", []),
+        "warnings": [*marker.get("position_warnings", []), *marker.get("code_warnings", [])],
     }
 
 

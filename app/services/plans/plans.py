@@ -10,7 +10,6 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from app.encoders.magnet.codebook import CodebookRules
 from app.errors import CodeTaken, Conflict, InvalidParameter
 from app.families import FAMILIES
 from app.families.family import Family
@@ -20,6 +19,7 @@ from app.markers.reading import MarkerRow
 from app.planning.alignment import Alignment
 from app.planning.outputs.package import OutputOptions
 from app.planning.outputs.plan_document import read_plan
+from app.planning.placement.place import tag_conditions
 from app.planning.plan import Plan, PlannedMarker, PlannedTag
 from app.planning.plan_checks import ExistingMarker
 from app.radio.settings import RadioSettings
@@ -466,7 +466,9 @@ def _commit_markers(
     """
     codebook_id = _store_codebook(connection, caller, plan, now)
     roads = _registry_roads(connection, caller.agency_id, plan.alignment)
-    commitment = Commitment(row.id, plan.alignment, rules, now, codebook_id, plan.radio or RadioSettings(), roads)
+    commitment = Commitment(
+        row.id, plan.alignment, rules, now, codebook_id, plan.radio or RadioSettings(), plan.rules.installation, roads
+    )
     stored: list[tuple[int, str]] = []
     covered = 0
     author, detail = author_of(caller), {"markers": plan.counts}
@@ -547,7 +549,7 @@ def _store_codebook(connection: sa.Connection, caller: Caller, plan: Plan, now: 
     agency_id = caller.agency_id
     row = CODEBOOKS.find(connection, agency_id, name=book.name)
     if row is None:
-        rules = CodebookRules()
+        rules = tag_conditions(plan.rules, plan.alignment)
         values = {
             **first_version(now),
             **book_columns(book),

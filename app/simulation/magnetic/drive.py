@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -281,7 +281,7 @@ def simulate_drive(scene: Scene, rng: np.random.Generator) -> SimulatedDrive:
 
 
 def _met(placed: PlacedTag) -> PlacedTag:
-    return PlacedTag(placed.tag.reversed_wrong_way(), placed.chainage_m, placed.left_m)
+    return replace(placed, tag=placed.tag.reversed_wrong_way())
 
 
 def _pose(scene: Scene, motion: Motion, yaw: Floats, t: Floats) -> tuple[Floats, Floats, Floats]:

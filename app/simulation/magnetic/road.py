@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.markers.magnet import MOMENT_AM2, InformationTag, Orientation, Polarity
+from app.markers.magnet import HALF_HEIGHT_M, MOMENT_AM2, InformationTag, Orientation, Polarity
 from app.values import Floats
 
 _STEP_M = 0.25  # [m] between points of the centre line; 4 mm of sagitta at 2 m radius
@@ -63,6 +63,7 @@ class RoadMagnet:
     polarity: Polarity
     orientation: Orientation
     tag: int = -1  # number of the information tag that it belongs to, -1 for a line's magnet
+    depth_m: float = -HALF_HEIGHT_M  # [m] of its centre below the road; without, it lies on the road
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,7 @@ class PlacedTag:
     tag: InformationTag
     chainage_m: float
     left_m: float = 0.0
+    depth_m: float = -HALF_HEIGHT_M  # [m] as of `RoadMagnet`
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,14 @@ class Spread:
 def tag_magnets(tags: Sequence[PlacedTag]) -> list[RoadMagnet]:
     """Magnets of information tags, tag by tag."""
     return [
-        RoadMagnet(placed.chainage_m + m.along_m, placed.left_m + m.lateral_m, m.polarity, m.orientation, number)
+        RoadMagnet(
+            placed.chainage_m + m.along_m,
+            placed.left_m + m.lateral_m,
+            m.polarity,
+            m.orientation,
+            number,
+            placed.depth_m,
+        )
         for number, placed in enumerate(tags)
         for m in placed.tag.magnets
     ]
@@ -123,7 +132,7 @@ def place_magnets(
     axis *= (sign * moment_am2 * (1 + rng.normal(0, spread.moment, n)) / np.linalg.norm(axis, axis=1))[:, None]
     dipoles = np.empty((n, 6))
     dipoles[:, :2] = road.world_m(chainage, left)
-    dipoles[:, 2] = 0.005 + off[:, 2]
+    dipoles[:, 2] = off[:, 2] - [m.depth_m for m in magnets]
     turned_to_world(axis, road.yaw_rad(chainage), out=dipoles[:, 3:])
     return dipoles, chainage
 

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
+from app.markers.magnet import Installation, Orientation
+from app.planning.magnet_checks import magnet_recall
 from app.planning.predict.rates import MagnetModel, PathModel, PlateModel, normal_quadrature
 from app.values import Floats
 from benchmarks.planning.fit.observe import LineSeen, PathSeen, PlatePassSeen, TagPassSeen
@@ -79,37 +81,42 @@ def _rounded_plates(model: PlateModel, fix_rms_m: float, exposures_s: tuple[floa
 
 
 def fit_tags(seen: Sequence[TagPassSeen]) -> MagnetModel:
-    """Logistic regression on clearance and curvature."""
-    clearance, bend = np.array([one.clearance_m for one in seen]), np.array([one.curvature_per_m for one in seen])
-    read = np.array([float(one.read) for one in seen])
-    values = _logistic(clearance, bend, read, np.ones(len(seen)))
+    """What tags are read beside the share of their magnets that is read at their distance."""
+    recall = magnet_recall(Orientation.FORWARD)
+    distance = np.array([Installation().distance_m(one.clearance_m) for one in seen])
+    magnets = np.array([recall.share_at(d) ** one.magnets for d, one in zip(distance.tolist(), seen, strict=True)])
+    bend, read = (np.array([getattr(one, name) for one in seen], float) for name in ("curvature_per_m", "read"))
     fixes = [one.fix_m for one in seen if one.fix_m is not None]
     rms = math.sqrt(sum(fix**2 for fix in fixes) / len(fixes))
+    values = _logistic(magnets, distance, bend, read, np.ones(len(seen)))
     return MagnetModel(*values, round(len(fixes) / float(read.sum()), 4), round(rms, 4))
 
 
 def fit_lines(seen: Sequence[LineSeen]) -> MagnetModel:
-    """Logistic regression of the magnets under the bar on clearance and curvature."""
-    passed = np.array([float(one.magnets) for one in seen])
-    return MagnetModel(
-        *_logistic(
-            np.array([one.clearance_m for one in seen]), np.array([one.curvature_per_m for one in seen]),
-            np.array([float(one.read) for one in seen]), passed,
-        )
-    )  # fmt: skip
+    """The same of the magnets of lines under the bar."""
+    recall = magnet_recall(Orientation.UP)
+    distance = np.array([Installation().distance_m(one.clearance_m) for one in seen])
+    magnets = np.array([recall.share_at(d) for d in distance.tolist()])
+    bend, read, passed = (
+        np.array([getattr(one, name) for one in seen], float) for name in ("curvature_per_m", "read", "magnets")
+    )
+    return MagnetModel(*_logistic(magnets, distance, bend, read, passed))
 
 
-def _logistic(clearance: Floats, bend: Floats, read: Floats, passed: Floats) -> tuple[float, float, float]:
+def _logistic(
+    magnets: Floats, distance: Floats, bend: Floats, read: Floats, passed: Floats
+) -> tuple[float, float, float]:
+    """Log-odds and their change with distance and curvature, of what is read times the share of the magnets read."""
     prior = np.array([3.0, 20.0, 100.0])  # source: by hand, standard deviations about 4, 0 and 0
 
     def loss(t: Floats) -> float:
-        rate = np.clip(expit(t[0] + t[1] * (clearance - 0.16) + t[2] * bend), _TINY, 1 - _TINY)
+        rate = np.clip(magnets * expit(t[0] + t[1] * (distance - 0.16) + t[2] * bend), _TINY, 1 - _TINY)
         seen = read * np.log(rate) + (passed - read) * np.log(1 - rate)
         return float((((t - (4.0, 0.0, 0.0)) / prior) ** 2).sum()) / 2 - float(seen.sum())
 
     found = minimize(loss, np.array([4.0, 0.0, 0.0]), method="Nelder-Mead", options={"maxfev": 2000})
-    at, slope, bent = (round(float(value), 4) for value in found.x)
-    return at, min(slope, 0.0), min(bent, 0.0)  # neither height nor bends help
+    straight, slope, bent = (round(float(value), 4) for value in found.x)
+    return straight, min(slope, 0.0), min(bent, 0.0)  # neither distance nor bends help
 
 
 def fit_path(seen: Sequence[PathSeen]) -> PathModel:

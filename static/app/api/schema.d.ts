@@ -2550,6 +2550,10 @@ export interface components {
             corridor_m: number;
             geometry: components["schemas"]["GeoLineIn"];
         };
+        /** @enum {string} */
+        app__markers__fiducial__Mounting: "upright" | "lying";
+        /** @enum {string} */
+        app__markers__magnet__Mounting: "hole" | "surface";
         ApprovalIn: {
             /** @default null */
             note?: string | null;
@@ -2664,6 +2668,7 @@ export interface components {
             alternatives: components["schemas"]["CostDocument"][];
             materials: components["schemas"]["CostDocument"][];
             total_usd: number;
+            without_price: components["schemas"]["UnpricedDocument"][];
         };
         /** @enum {string} */
         BoundaryStyle: "solid" | "dashed" | "none" | "unknown";
@@ -3856,7 +3861,7 @@ export interface components {
         };
         FiducialGeometry: {
             image: components["schemas"]["SignImage"] | null;
-            mounting: components["schemas"]["Mounting"];
+            mounting: components["schemas"]["app__markers__fiducial__Mounting"];
             quiet_mm: number;
             side_mm: number;
         };
@@ -3864,7 +3869,7 @@ export interface components {
             /** @default null */
             image?: components["schemas"]["SignImage"] | null;
             /** @default upright */
-            mounting?: components["schemas"]["Mounting"];
+            mounting?: components["schemas"]["app__markers__fiducial__Mounting"];
             /** @default null */
             quiet_mm?: number | null;
             side_mm: number;
@@ -4013,6 +4018,7 @@ export interface components {
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
+            depth_m: number;
             distance_m?: number;
             /**
              * @description discriminator enum property added by openapi-typescript
@@ -4022,6 +4028,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
+            installation: components["schemas"]["Installation-Output"];
             layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             measure_m: number | null;
             offset_m: number | null;
@@ -4037,6 +4044,7 @@ export interface components {
         FoundPlateDocument: {
             along?: components["schemas"]["AlongDocument"];
             code: components["schemas"]["PlateCodeDocument"];
+            code_warnings: components["schemas"]["WarningDocument"][];
             /** Format: date-time */
             created_at: string;
             distance_m?: number;
@@ -4264,6 +4272,22 @@ export interface components {
             segment_m: number;
             text: string;
             tuple: string;
+        };
+        "Installation-Input": {
+            /** @default null */
+            hole_depth_mm?: number | null;
+            /** @default null */
+            hole_diameter_mm?: number | null;
+            /** @default hole */
+            mounting?: components["schemas"]["app__markers__magnet__Mounting"];
+            /** @default null */
+            shell_height_mm?: number | null;
+        };
+        "Installation-Output": {
+            hole_depth_mm: number | null;
+            hole_diameter_mm: number | null;
+            mounting: components["schemas"]["app__markers__magnet__Mounting"];
+            shell_height_mm: number | null;
         };
         Intrinsics: {
             cx_px: number;
@@ -4596,6 +4620,7 @@ export interface components {
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
+            depth_m: number;
             /**
              * @description discriminator enum property added by openapi-typescript
              * @enum {string}
@@ -4604,6 +4629,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
+            installation: components["schemas"]["Installation-Output"];
             lane: components["schemas"]["LaneDocument"];
             layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             length_m: number;
@@ -4626,6 +4652,7 @@ export interface components {
             code: components["schemas"]["InformationTagDocument"] | components["schemas"]["LineTagDocument"];
             /** Format: date-time */
             created_at: string;
+            depth_m: number;
             /**
              * @description discriminator enum property added by openapi-typescript
              * @enum {string}
@@ -4634,6 +4661,7 @@ export interface components {
             heading_deg: number | null;
             heading_rmse_deg: number | null;
             id: string;
+            installation: components["schemas"]["Installation-Output"];
             layout: components["schemas"]["TagPlace"] | components["schemas"]["LinePlace"];
             measure_m: number | null;
             offset_m: number | null;
@@ -4651,6 +4679,7 @@ export interface components {
             family: "magnet";
             /** @default null */
             heading_rmse_deg?: number | null;
+            installation?: components["schemas"]["Installation-Input"];
             /** @default null */
             kind?: ("as-planned" | "as-built" | "resurvey" | "correction" | "change") | null;
             lane: components["schemas"]["LaneIn"];
@@ -4834,8 +4863,6 @@ export interface components {
             permissions: string[];
             scope: components["schemas"]["Scope"];
         };
-        /** @enum {string} */
-        Mounting: "upright" | "lying";
         MultiLineStringIn: {
             coordinates: number[][][];
             /**
@@ -5387,6 +5414,7 @@ export interface components {
         };
         PlateDocument: {
             code: components["schemas"]["PlateCodeDocument"];
+            code_warnings: components["schemas"]["WarningDocument"][];
             /** Format: date-time */
             created_at: string;
             /**
@@ -6524,8 +6552,8 @@ export interface components {
             design_speed_m_s?: number | null;
             /** @default 2.5 */
             reaction_s?: number;
-            /** @default 0.3 */
-            readable_clearance_m?: number;
+            /** @default null */
+            readable_clearance_m?: number | null;
             /** @default null */
             stop_line_chainage_m?: number | null;
             /**
@@ -6535,14 +6563,28 @@ export interface components {
              *     ]
              */
             vehicles?: string[];
+            /**
+             * @default [
+             *       1.8,
+             *       2.3
+             *     ]
+             */
+            wheel_circumference_m?: [
+                number,
+                number
+            ];
         };
         "Site-Output": {
             deceleration_m_s2: number;
             design_speed_m_s: number | null;
             reaction_s: number;
-            readable_clearance_m: number;
+            readable_clearance_m: number | null;
             stop_line_chainage_m: number | null;
             vehicles: string[];
+            wheel_circumference_m: [
+                number,
+                number
+            ];
         };
         SpatialExtent: {
             bbox: number[][];
@@ -6915,6 +6957,11 @@ export interface components {
         UnmeasuredMarker: {
             marker_id: string;
             why: string | null;
+        };
+        UnpricedDocument: {
+            item: string;
+            quantity: number;
+            unit: string;
         };
         UploadContext: {
             /** @default null */

@@ -11,12 +11,12 @@ import { t, textOr } from "../texts/index.js";
 const FAMILIES = ["plates", "lines", "tags", "cerpm"];
 const OPTIONAL = [...FAMILIES, "decision_points", "quality", "temporary"];
 const LISTS = ["cameras", "costs.items"];
-const GROUPS = ["road", "avoid", "predictions", "cameras", "costs", "quality", "temporary", "installation", "tolerances", "applies"];
+const GROUPS = ["road", "avoid", "vehicles", "predictions", "cameras", "costs", "quality", "temporary", "installation", "tolerances", "applies"];
 /** Fields that are shown at once; the others of a group are below "More". @type {Record<string, string[]>} */
 const FIRST = {
   plates: ["spacing_m", "scheme", "n", "unit_mm"],
   lines: ["max_spacing_m", "sides", "solid", "dashed"],
-  tags: ["at", "before", "magnets"],
+  tags: ["at", "before", "magnets", "size"],
   cerpm: ["straight", "curve", "n_m", "max_path_error_m"],
   decision_points: ["at", "before"],
   road: ["design_speed_kmh", "curve_radius_m", "lanes"],

@@ -23,6 +23,7 @@ function TagForm({ schema, books }) {
   const entries = useLoad(async (signal) => (await page(api.GET("/v1/codebooks/{codebook_id}/entries", { params: { path: { codebook_id: book } }, signal }))).items, [book]);
   const submit = async () => {
     const { meaning, line, codebook: _codebook, ...values } = form.values;
+    delete values[values["installation.mounting"] === "surface" ? "installation.hole_depth_mm" : "installation.shell_height_mm"];
     const body = { family: "magnet", lane: {}, tag: {}, ...bodyOf(values, schema) };
     const entry = entries.data?.[Number(meaning)];
     Object.assign(body.tag, { codebook_id: book }, entry && { meaning: { kind: entry.meaning.kind, value: entry.meaning.value } });
@@ -52,6 +53,10 @@ function TagForm({ schema, books }) {
         ${field("site.design_speed_m_s", { placeholder: "13.4" })}
         ${field("site.stop_line_chainage_m")}
         ${field("road")}
+      </${Group}>
+      <${Group} title=${t("rules.installation")}>
+        ${field("installation.mounting")}
+        ${form.values["installation.mounting"] === "surface" ? field("installation.shell_height_mm", { placeholder: "15" }) : field("installation.hole_depth_mm", { placeholder: "30" })}
       </${Group}>
     </${FormFrame}>
   `;

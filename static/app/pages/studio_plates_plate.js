@@ -217,7 +217,7 @@ function Registration({ schema, typed }) {
     const { position, ...others } = more;
     const text = plateText({ family: "plate", ...body, ...others, position: { ...body.position, ...position } });
     const marker = await (await request("/v1/markers", jsonText(text))).json();
-    notify(t("register.done", { code: codeOf(marker) }));
+    notify(t("register.done", { code: codeOf(marker) }), { detail: marker.code_warnings.map((/** @type {any} */ warning) => warning.message).join(" ") });
     navigate(`/markers/${marker.id}`);
   };
   const field = (/** @type {string} */ path, more = {}) => html`<${SchemaField} form=${form} schema=${schema} path=${path} ...${more} />`;

@@ -70,6 +70,19 @@ def test_a_plain_position_plate(client: httpx.Client, place: Place) -> None:
     assert client.get(response.headers["location"]).json() == marker
 
 
+def test_a_scheme_without_a_check_has_a_warning(client: httpx.Client, place: Place) -> None:
+    marker = created(client, "/v1/markers", position=place(), code=PLAIN)
+    [warning] = marker["code_warnings"]
+    assert (warning["field"], warning["code"]) == ("code.scheme", "scheme-without-check")
+    assert "position-robust" in warning["proposal"]
+    assert client.get(f"/v1/markers/{marker['id']}").json()["code_warnings"] == [warning]
+    for code in (ROBUST, {"scheme": "id"}, {"scheme": "position-check"}):
+        assert created(client, "/v1/markers", position=place(), code=code)["code_warnings"] == []
+    bulk = {"items": [{"create": {"position": place(), "code": PLAIN}}], "dry_run": True}
+    [item] = client.post("/v1/markers/bulk", json=bulk).json()["results"]
+    assert item["warnings"] == [warning]
+
+
 def test_provenance_is_kept(client: httpx.Client, place: Place) -> None:
     position = place() | {
         "height_m": 5.21,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,3 +215,15 @@ def test_a_poor_odometer_costs_codes() -> None:
     good = rules_at(ReadingConditions(13.4, 0.25))
     poor = rules_at(ReadingConditions(13.4, 0.25, OdometerError(drift=0.03), MagnetErrorModel()))
     assert codebook_capacity(FINE, poor) < codebook_capacity(FINE, good)
+
+
+def test_the_documented_codes_of_longer_tags_are_those_of_the_error_model() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "plans.md").read_text("utf-8")
+    rows = re.findall(r"^\| (\d+) m, ([\d.]+) m[^|]*\|\s*(\d+) \|(.+)\|$", text, re.MULTILINE)
+    assert len(rows) == 5
+    for length, segment, codes, cells in rows:
+        design = TagDesign(3, float(length), float(segment))
+        assert design.coupled_capacity == int(codes)
+        for distance_m, cell in zip((0.3, 0.4, 0.5), cells.split("|"), strict=True):
+            rules = [CodebookRules(speed_m_s=kmh / 3.6, clearance_m=distance_m) for kmh in (50, 80, 110, 130)]
+            assert [codebook_capacity(design, one) for one in rules] == [int(count) for count in cell.split(",")]

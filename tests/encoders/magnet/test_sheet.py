@@ -36,7 +36,7 @@ FORMULAS = ["=1+1", "+1+1", "-1-1", "@SUM(A1)", "＝1+1"]
 def tag_sheet(
     lane: LaneLine, tag: InformationTag = TAG, name: str = "tag 7", meaning: Meaning | None = None
 ) -> DrillingSheet:
-    site = Site(13.41, 140.0, ("sedan", "van"))
+    site = Site(13.41, 140.0, ("sedan", "van"), readable_clearance_m=0.3)
     near = Neighbour("near", *lane.lon_lat(lane.at(90.0)))
     return drilling_sheet(place_tag(lane, tag, 70.0, name=name, meaning=meaning), site, (near,))
 

@@ -12,7 +12,7 @@ from app.markers.plate import PlateGeometry
 from app.markers.reading import Verdict
 from app.planning.alignment import Alignment, RoadEvent
 from app.planning.placement import place_plan
-from app.planning.plan import Plan, PlanFinding
+from app.planning.plan import Plan, PlanFinding, PlannedTag
 from app.planning.plan_checks import ExistingMarker, check_plan
 from app.planning.plan_checks.families import frames_per_pass, readable_zone_m
 from app.planning.plate_view import camera_of
@@ -170,3 +170,79 @@ def test_the_path_beside_a_shared_line_is_that_of_the_lane() -> None:
     lon, lat = lane.position_at(lane.chainage_m, 3.5)
     plan = checked(road(lane, replace(lane, name="2", lon_deg=lon, lat_deg=lat)), cerpm={})
     assert finding(plan, "path-error").figure < 0.001
+
+
+# --- magnets: depth, mounting, wheels and the length of tags ----------------------------------------------------------
+
+
+LIMIT = RoadEvent(EventKind.SPEED_LIMIT, "1", 300.0, 50.0)
+
+
+def magnets_on(speed_kmh: float = 50.0, **rules: object) -> Plan:
+    """A plan of tags and lines."""
+    alignment = replace(road(straight(400, speed_kmh=speed_kmh)), events=(LIMIT,))
+    return checked(alignment, **({"tags": {"at": ["speed_limit"]}, "lines": {}} | rules))
+
+
+def test_the_depth_of_holes_counts_in_checks_and_predictions() -> None:
+    flush, deep = (
+        magnets_on(installation={"hole_depth_mm": depth}, predictions={"clearance_m": 0.25}) for depth in (30, 300)
+    )
+    for name in ("clearance utility", "clearance utility line"):
+        near, far = finding(flush, name), finding(deep, name)
+        assert far.figure - near.figure == pytest.approx(0.27)
+        assert (near.verdict, far.verdict) == (Verdict.OK, Verdict.WARN)
+        assert "hole_depth_mm" in far.sentence
+    for name in ("predicted-read-rate tags", "predicted-read-rate line"):
+        near, far = finding(flush, name), finding(deep, name)
+        assert near.figure > 0.9 > far.figure
+        assert (near.verdict, far.verdict) == (Verdict.OK, Verdict.WARN)
+    assert finding(deep, "tag-resolution").limit > 3 * finding(flush, "tag-resolution").limit
+
+
+def test_magnets_on_the_surface_are_nearer_than_drilled_ones() -> None:
+    drilled, glued = magnets_on(installation={"hole_depth_mm": 60}), magnets_on(installation={"mounting": "surface"})
+    assert finding(glued, "clearance utility").figure == pytest.approx(
+        finding(drilled, "clearance utility").figure - 0.06
+    )
+    assert finding(glued, "shell-height").verdict is Verdict.OK
+    assert not [found for found in drilled.findings if found.name == "shell-height"]
+    high = magnets_on(installation={"mounting": "surface", "shell_height_mm": 40})
+    assert finding(high, "shell-height").verdict is Verdict.WARN
+
+
+def test_lines_keep_off_the_turns_of_wheels() -> None:
+    plan = magnets_on(lines={"max_spacing_m": 2.3})  # one turn of a wheel; the nearest free spacing is below
+    apart = np.diff([m.chainage_m for m in plan.markers if m.code == "N_90"])
+    assert np.median(apart) == pytest.approx(1.74, abs=0.01)
+    assert finding(plan, "wheel-turns").verdict is Verdict.OK
+    usual = magnets_on()  # 6 m are three turns, which are read like any other spacing
+    assert np.median(np.diff([m.chainage_m for m in usual.markers if m.code == "N_90"])) == pytest.approx(400 / 67)
+    everything = magnets_on(vehicles={"wheel_circumference_m": [0.6, 5.0]})  # no spacing is free
+    found = finding(everything, "wheel-turns")
+    assert (found.verdict, found.figure) == (Verdict.WARN, 2)
+    assert "lines.max_spacing_m" in found.sentence
+
+
+def test_longer_tags_keep_their_codes_at_high_speed_above_deep_magnets() -> None:
+    fast = {"speed_kmh": 130.0, "installation": {"hole_depth_mm": 200}}
+    short = magnets_on(**fast, tags={"at": ["speed_limit"]})  # type: ignore[arg-type]
+    long = magnets_on(**fast, tags={"at": ["speed_limit"], "size": "freeway"})  # type: ignore[arg-type]
+    assert [tag.detail.tag.length_m for tag in long.markers if isinstance(tag.detail, PlannedTag)] == [12.0]
+    assert finding(short, "tag-resolution").verdict is Verdict.WARN
+    assert "tags.size: freeway" in finding(short, "tag-resolution").sentence
+    assert finding(long, "tag-resolution").verdict is Verdict.OK
+    assert "130 km/h" in finding(long, "codebook-room").sentence
+    assert finding(long, "codebook-room").figure < finding(short, "codebook-room").figure
+
+
+def test_plain_positions_are_not_for_vehicles_that_read_alone() -> None:
+    alone = checked(road(straight(400)), plates={"scheme": "position"})
+    found = finding(alone, "plate-check")
+    assert (found.verdict, found.figure) == (Verdict.WARN, len(alone.markers))
+    assert "position-robust" in found.sentence
+    assert "vehicles.read_alone" in found.sentence
+    with_registry = checked(road(straight(400)), plates={"scheme": "position"}, vehicles={"read_alone": False})
+    assert finding(with_registry, "plate-check").verdict is Verdict.OK
+    for scheme in ("id", "position-robust", "position-check"):
+        assert finding(checked(road(straight(400)), plates={"scheme": scheme}), "plate-check").verdict is Verdict.OK

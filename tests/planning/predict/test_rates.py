@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,12 +77,13 @@ def test_rates_of_many_plates_are_those_of_each() -> None:
 def test_tags_and_lines_are_read_less_often_from_higher_and_in_bends() -> None:
     lane = bend(30.0)
     places = np.array([10.0, 215.0])
-    for rates in (tag_rates, line_rates):
-        low, high = rates(lane, places, 0.12), rates(lane, places, 0.45)
-        assert (low >= high).all()
+    for rates in (lambda distance_m: tag_rates(lane, places, distance_m, 3), partial(line_rates, lane, places)):
+        low, high = rates(0.12), rates(0.6)
+        assert (low > high).all()
         assert low[0] >= low[1]
         assert low[0] > 0.98
-    assert tag_rates(lane, places, 0.45)[0] < 0.8
+        assert high[0] < 0.1
+    assert tag_rates(lane, places, 0.4, 7)[0] < tag_rates(lane, places, 0.4, 3)[0]
 
 
 def test_path_errors_grow_with_the_survey_the_spacing_and_missing_markers() -> None:
