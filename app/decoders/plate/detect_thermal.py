@@ -43,7 +43,7 @@ class WarmSearch:
     min_extent_px: int = 12  # least width and height of a region: 1.25 pixels a unit on 8 x 8, and blur
     min_fill: float = 0.35  # [1] least share of its box that a region fills
     max_regions: int = 10  # of each polarity, the warmest and largest first. For speed
-    max_quads: int = 8  # of a frame. For speed
+    max_quads: int = 5  # of a frame. For speed
     same_box: float = 0.12  # [extent] by which the sides of boxes of one region differ
     edge_share: float = 0.5  # [warmth of the region] level of its outline, which a trail moves as a whole
     joined: float = 0.3  # [extent] over which light units are closed
@@ -61,9 +61,9 @@ class WarmSearch:
 SEARCH = WarmSearch()
 TRAILS = (0.0, 0.03, 0.06, 0.09, 0.12, 0.16, 0.21, 0.27, 0.34, 0.43)
 """[rows of the quadrangle] trails that are tried. Source: 6 to 12 ms at 10 to 30 km/h are 17 to 100 mm of 325."""
-FIRST_TRAILS = (3, 6)
-"""Of these, by their places, those under which all geometries are tried. Source: a fit converges with trails that are
-wrong by half of themselves."""
+FIRST_TRAILS = (0.09, 0.0, 0.21)
+"""Of these, those under which all geometries are tried. Source: a fit converges with a trail that is wrong by half of
+it."""
 EDGE_LAG = math.log(2.0)
 """[trails] by which the outline at half of the warmth lags: exp(-x) = 1/2."""
 STRETCH_PERCENT = (0.2, 99.8)
@@ -79,6 +79,9 @@ MARKER_SPREAD = 0.1
 ORIENTATIONS = np.array([[0, 1, 0, 0, 0], [0, 0, 0.45, 0, 0], [0, 0, 0, 0.45, 0], [0, 0, 0, 0, 0.45]])
 """[contrast] levels of the triangle, of its other half and of the squares where the triangle is in the first corner, or
 in another one, clockwise."""
+MAX_MARKER_MISFIT = 25.0
+"""[1] sum of the five markers' squared deviations, in spreads, from which there is no triangle. Source: chi-squared of
+five degrees of freedom, 1e-4."""
 ORIENTATION_EVIDENCE = 12.0
 """[log likelihood] by which the best orientation must exceed the next. Effect: `python -m
 benchmarks.plates.thresholds`."""
@@ -91,20 +94,17 @@ class WarmQuad:
         self.inverted = inverted  # the frame, bright where the quadrangle is not
         self.corners_px = corners_px  # shape (4, 2): clockwise in the image
         self.rows_px = float(np.ptp(corners_px[:, 1]))
-        self._sharp: dict[int, Grey] = {}
 
-    def without_trail(self, trail: int) -> Grey:
-        """The frame without a trail around the quadrangle, by its place in `TRAILS`, made once."""
-        if trail not in self._sharp:
-            self._sharp[trail] = without_trail(self.inverted, self.corners_px, TRAILS[trail] * self.rows_px)
-        return self._sharp[trail]
+    def without_trail(self, trail: float) -> Grey:
+        """The frame without a trail around the quadrangle. [rows of the quadrangle]"""
+        return without_trail(self.inverted, self.corners_px, trail * self.rows_px)
 
 
 class _TrailFit(NamedTuple):
     """A fit under a geometry and a trail."""
 
     geometry: PlateGeometry
-    trail: int  # place in `TRAILS`
+    trail: float  # [rows of the quadrangle]
     fit: PlateFit
     share: float  # of the variance of the units that two levels explain
     sharp: Grey  # the frame without the trail
@@ -251,14 +251,33 @@ def _fit_quad(quad: WarmQuad, geometries: Sequence[PlateGeometry]) -> WarmPlate 
     best = _first_fit(quad, geometries)
     if best is None or best.share < MIN_TWO_LEVEL:
         return None
+    place = TRAILS.index(best.trail)
+    shares = {place: best.share}
     for step in (-1, 1):
-        while 0 <= best.trail + step < len(TRAILS):
-            sharp = quad.without_trail(best.trail + step)
-            fit = refit_plate(sharp, best.fit, best.geometry, linear=True)
-            if fit is None or two_level_share(fit) <= best.share:
+        while 0 <= place + step < len(TRAILS):
+            other = _refit(quad, best, TRAILS[place + step])
+            shares[place + step] = 0.0 if other is None else other.share
+            if other is None or other.share <= best.share:
                 break
-            best = _TrailFit(best.geometry, best.trail + step, fit, two_level_share(fit), sharp)
+            best, place = other, place + step
+    if place - 1 in shares and place + 1 in shares:
+        between = _refit(quad, best, _vertex(TRAILS[place - 1 : place + 2], [shares[place + k] for k in (-1, 0, 1)]))
+        best = best if between is None else between
     return _turned(best)
+
+
+def _refit(quad: WarmQuad, best: _TrailFit, trail: float) -> _TrailFit | None:
+    """The fit with another trail."""
+    sharp = quad.without_trail(trail)
+    fit = refit_plate(sharp, best.fit, best.geometry, linear=True)
+    return None if fit is None else _TrailFit(best.geometry, trail, fit, two_level_share(fit), sharp)
+
+
+def _vertex(places: Sequence[float], values: Sequence[float]) -> float:
+    """Where the parabola through three points, of which the middle one is highest, has its vertex."""
+    (a, b, c), (u, v, w) = places, values
+    right, left = (b - a) * (v - w), (b - c) * (v - u)
+    return b - 0.5 * ((b - a) * right - (b - c) * left) / max(right - left, 1e-12)
 
 
 def _first_fit(quad: WarmQuad, geometries: Sequence[PlateGeometry]) -> _TrailFit | None:
@@ -266,7 +285,7 @@ def _first_fit(quad: WarmQuad, geometries: Sequence[PlateGeometry]) -> _TrailFit
     best: _TrailFit | None = None
     possible = [geometry for geometry in geometries if quad.rows_px > MIN_UNIT_ROWS * geometry.n]
     for trail in FIRST_TRAILS:
-        lag_px = np.array((0.0, EDGE_LAG * TRAILS[trail] * quad.rows_px))
+        lag_px = np.array((0.0, EDGE_LAG * trail * quad.rows_px))
         sharp = quad.without_trail(trail)
         for geometry in possible:
             fit = fit_plate(sharp, _centroids(quad.corners_px + lag_px, geometry), geometry, linear=True)
@@ -278,8 +297,8 @@ def _first_fit(quad: WarmQuad, geometries: Sequence[PlateGeometry]) -> _TrailFit
     return best
 
 
-def _turned(found: _TrailFit) -> WarmPlate:
-    """The fit with the triangle in the corner whose halves differ most, and the evidence for that corner.
+def _turned(found: _TrailFit) -> WarmPlate | None:
+    """The fit with the triangle in the corner whose halves differ most; None where no corner has it.
 
     Between the levels of the dark units, 0, and of the light ones, 1, a square has a value of 0, the triangle 0 and the
     other half of its cell 1; a cell with the triangle that is fitted as a square has about a half.
@@ -287,17 +306,17 @@ def _turned(found: _TrailFit) -> WarmPlate:
     fit, geometry = found.fit, found.geometry
     for _ in range(2):
         markers, spread = _marker_levels(fit)
-        likely = np.array([-((markers - expected) ** 2).sum() for expected in ORIENTATIONS]) / (2 * spread**2)
-        best = int(likely.argmax())
+        misfits = np.array([((markers - expected) ** 2).sum() for expected in ORIENTATIONS]) / spread**2
+        best = int(misfits.argmin())
         if best == 0:
-            break
-        turned = fit_plate(
-            found.sharp, np.roll(_centroids(fit.corners_px, geometry), -best, axis=0), geometry, linear=True
-        )
+            is_plate = misfits[0] < MAX_MARKER_MISFIT
+            return WarmPlate(geometry, fit, float(misfits[1:].min() - misfits[0]) / 2) if is_plate else None
+        turned_px = np.roll(_centroids(fit.corners_px, geometry), -best, axis=0)
+        turned = fit_plate(found.sharp, turned_px, geometry, linear=True)
         if turned is None:
-            break
+            return None
         fit = turned
-    return WarmPlate(geometry, fit, float(likely[0] - np.delete(likely, 0).max()))
+    return WarmPlate(geometry, fit, 0.0)
 
 
 def _marker_levels(fit: PlateFit) -> tuple[Array, float]:
