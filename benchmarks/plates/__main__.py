@@ -148,7 +148,9 @@ def main() -> None:
 _TRIALS_NOTE = (
     "Frames per drive, mean over the seeds. A plate is in view if all its corners are inside the frame and it is at "
     f"least {MIN_ROWS:g} rows high. Frames in which it has fewer than {RENDERED_ROWS:g} rows are not processed and "
-    "count as not decoded. Every seed must meet the goal, so 'minimum' is compared with it."
+    "count as not decoded. Every seed must meet the goal, so 'minimum' is compared with it. "
+    "'Algorithm 1' is the paper's own algorithm (`frames.method` = `paper`) on the same frames, in the boxes of our "
+    "candidates; 'paper' is what the paper reports of its road. 'Decoded' counts all digits, with a check or without."
 )
 _PEERS_NOTE = (
     'The same scenes with a tag that has the plate\'s footprint; default parameters, one thread. The columns "plate" '
