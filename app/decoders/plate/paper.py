@@ -45,7 +45,7 @@ GEOMETRY = PlateGeometry()
 """The paper's plate: 8 x 8 units, decimal digits."""
 GREEN_RANGE_DEG, RED_RANGE_DEG = 120.0, 60.0
 """[deg] alpha of equations 1 and 2: width of the range of hues around 120 and 0."""
-MIN_SATURATION, MIN_VALUE = 0.12, 0.1
+MIN_SATURATION, MIN_VALUE = 0.18, 0.1
 """[1] beta and gamma of the same equations."""
 DARK_SHARE = 0.5
 """[1] epsilon: mean of a unit's binary pixels above which it is dark."""
@@ -58,7 +58,7 @@ HARRIS_BLOCK, HARRIS_APERTURE, HARRIS_K, HARRIS_SHARE = 2, 3, 0.04, 0.01
 pixel is a corner."""
 MAX_VERTEX_PX = 2.0
 """[px] of a vertex from the marker that it is of, beyond which it is not that of a marker."""
-BOX_PAD = 0.06
+BOX_PAD = 0.03
 """[extent] around a plate that a detector's box leaves."""
 MAX_BOXES = 4
 """[boxes] of a frame."""
