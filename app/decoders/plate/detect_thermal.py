@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate import Array
-from app.decoders.plate.fit import PlateFit, fit_plate, refit_plate
+from app.decoders.plate.fit import PlateFit, finish_fit, fit_coarsely, fit_plate, refit_plate
 from app.decoders.plate.pose import marker_centroids
 from app.markers.plate import PlateGeometry, unit_index
 
@@ -72,6 +72,8 @@ MIN_TWO_LEVEL, CLEAR_TWO_LEVEL = 0.75, 0.9
 """[1] share of the variance of units that two levels explain, from which a fit may be a plate, and from which no other
 geometry is tried. Source: an even distribution has 0.75; of fits of plates under wrong geometries, the most is
 0.82, and under the right one plates of 18 rows and more have 0.87 to 0.99."""
+MIN_COARSE_TWO_LEVEL = 0.6
+"""[1] the same share after the coarse stage, below which a fit is not finished: normally distributed units have 0.64."""
 MIN_UNIT_ROWS = 1.25
 """[px] height of a unit below which a geometry is not tried. Source: `evidence.MIN_ROWS_ALONE`."""
 MARKER_SPREAD = 0.1
@@ -281,17 +283,26 @@ def _vertex(places: Sequence[float], values: Sequence[float]) -> float:
 
 
 def _first_fit(quad: WarmQuad, geometries: Sequence[PlateGeometry]) -> _TrailFit | None:
-    """The fit whose units have the clearest levels, of those with a few trails under all geometries."""
+    """The fit whose units have the clearest levels, of those with a few trails under all geometries.
+
+    The coarse fits decide; only a few of them are finished.
+    """
     best: _TrailFit | None = None
+    most = MIN_COARSE_TWO_LEVEL
     possible = [geometry for geometry in geometries if quad.rows_px > MIN_UNIT_ROWS * geometry.n]
     for trail in FIRST_TRAILS:
         lag_px = np.array((0.0, EDGE_LAG * trail * quad.rows_px))
         sharp = quad.without_trail(trail)
         for geometry in possible:
-            fit = fit_plate(sharp, _centroids(quad.corners_px + lag_px, geometry), geometry, linear=True)
-            share = 0.0 if fit is None else two_level_share(fit)
-            if fit is not None and (best is None or share > best.share):
-                best = _TrailFit(geometry, trail, fit, share, sharp)
+            coarse = fit_coarsely(sharp, _centroids(quad.corners_px + lag_px, geometry), geometry, linear=True)
+            if coarse is None:
+                continue
+            share = _best_division(np.sort(coarse.model.values[: unit_index(geometry.n).size]))[0]
+            if share < most:
+                continue
+            fit = finish_fit(sharp, coarse, geometry, linear=True)
+            if fit is not None and (best is None or two_level_share(fit) > best.share):
+                best, most = _TrailFit(geometry, trail, fit, two_level_share(fit), sharp), share
                 if best.share > CLEAR_TWO_LEVEL:
                     return best
     return best
