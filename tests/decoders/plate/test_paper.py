@@ -9,9 +9,8 @@ import pytest
 from app.decoders.plate.paper import CONFIDENCE, decode_box, decode_plates_paper, find_markers, find_vertices
 from app.errors import InvalidParameter
 from app.markers.reading import PlateOutcome, PlateReading
-from app.sensors.camera import Camera
 from app.simulation.plate_scene import PlacedFace
-from tests.decoders.plate.scenes import PAPER, face_of, marker_units, painted, shoot, shoot_plate
+from tests.decoders.plate.scenes import CAMERA, PAPER, face_of, marker_units, painted, shoot, shoot_plate
 
 BLACK, GREY = (0.04,) * 3, (0.2,) * 3
 PITCH_PX = 40
@@ -49,9 +48,8 @@ def test_the_paper_s_plate_shows_the_digits_that_the_paper_prints() -> None:
 
 
 def test_a_plate_on_the_road_is_read_and_placed() -> None:
-    camera = Camera.from_field_of_view(1920, 1080, 70.0)
-    image = shoot(PlacedFace(face_of(), 1.6, 0.0, 0.0)).image
-    read = [r for r in decode_plates_paper(image, camera=camera) if r.digits]
+    image = shoot(PlacedFace(face_of(), 2.2, 0.0, 0.0)).image
+    read = [r for r in decode_plates_paper(image, camera=CAMERA) if r.digits]
     assert [r.digits for r in read] == [PAPER.digits]
     assert read[0].pose is not None
 
