@@ -24,7 +24,7 @@ from app.decoders.plate.fit import PlateFit, finish_fit, fit_coarsely, fit_plate
 from app.decoders.plate.pose import marker_centroids
 from app.markers.plate import PlateGeometry, unit_index
 
-Grey = npt.NDArray[np.uint8]
+Grey = Array  # of uint8, shape (H, W)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ MIN_TWO_LEVEL, CLEAR_TWO_LEVEL = 0.75, 0.9
 geometry is tried. Source: an even distribution has 0.75; of fits of plates under wrong geometries, the most is
 0.82, and under the right one plates of 18 rows and more have 0.87 to 0.99."""
 MIN_COARSE_TWO_LEVEL = 0.6
-"""[1] the same share after the coarse stage, below which a fit is not finished: normally distributed units have 0.64."""
+"""[1] the same share after the coarse stage, below which a fit is not finished: a normal distribution has 0.64."""
 MIN_UNIT_ROWS = 1.25
 """[px] height of a unit below which a geometry is not tried. Source: `evidence.MIN_ROWS_ALONE`."""
 MARKER_SPREAD = 0.1
