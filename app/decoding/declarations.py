@@ -76,6 +76,11 @@ class DeclaredFrames(Declaration):
         "MJPEG stream. [Hz]",
     )
     poses: PoseDeclaration | None = Field(None, description="Of frames.csv, or of a track beside the frames.")
+    method: Literal["waymark", "paper"] = Field(
+        "waymark",
+        description="`paper` reads plates by the paper's own algorithm, in pictures and ZIPs of colour pictures: for "
+        "comparison. It makes no missed observations of markers.",
+    )
 
     @cached_property
     def track(self) -> PoseDeclaration:
@@ -154,6 +159,11 @@ class Profile(Declaration):
         "formats. In a context it states that the file is one.",
     )
 
+    @property
+    def is_paper(self) -> bool:
+        """Whether plates are read by the paper's own algorithm."""
+        return self.frames is not None and self.frames.method == "paper"
+
     def check(self) -> None:
         """Refuse what is incomplete or contradicts itself, after a vehicle's profile completed an upload's context.
 
@@ -167,6 +177,13 @@ class Profile(Declaration):
         if self.trace is not None:
             with naming("trace"):
                 self.trace.check()
+        if self.thermal and self.is_paper:
+            raise InvalidParameter(
+                "the method paper finds plates by their colours, which a thermal frame does not have",
+                field="frames.method",
+                limit="waymark with thermal",
+                cure="leave frames.method out, or set thermal to false",
+            )
         if self.thermal_range is not None:
             check_thermal_range(self.thermal_range)
             if not self.thermal:

@@ -106,6 +106,7 @@ class PlateSearch:
     codebook: tuple[PlateCode, ...] = ()  # plates that the registry knows nearby
     # dimensions to look for; the decoder's own where there are none
     geometries: tuple[PlateGeometry, ...] = ()  # dimensions to look for; the decoder's own where there are none
+    is_paper: bool = False  # by the paper's own algorithm
 
 
 def search_plates(nearby: Nearby, camera: Camera | None) -> PlateSearch:
@@ -125,6 +126,10 @@ def read_plates(
     pixels: Pixels, search: PlateSearch, decode: DecodePlates = decode_plates, *, thermal: bool = False
 ) -> Sequence[PlateReading]:
     """Decode the plates of a frame."""
+    if search.is_paper:
+        from app.decoders.plate.paper import decode_plates_paper  # loaded with the first frame, as the reader is
+
+        return decode_plates_paper(pixels, camera=search.camera)
     options = {"geometries": search.geometries} if search.geometries else {}
     return decode(pixels, camera=search.camera, codebook=search.codebook, thermal=thermal, **options)
 

@@ -223,9 +223,15 @@ class PlateOutcome(StrEnum):
 
 
 class Certainty(StrEnum):
-    """How sure digits are. Tentative ones give no position, until another frame or the registry confirms them."""
+    """How sure digits are.
+
+    Unchecked ones have neither checks nor a registered plate that confirms them: a unit that peeled off, or tape that
+    covers just one, shows other digits in every frame. Tentative ones give no position, until another frame or the
+    registry confirms them.
+    """
 
     SURE = "sure"
+    UNCHECKED = "unchecked"
     TENTATIVE = "tentative"
 
 
@@ -275,6 +281,7 @@ class PlateReading:
     confidence: float = 0.0  # probability that all digits, or the likely ones, are right, 0 to 1
     cell_confidence: tuple[float, ...] = ()  # probability that each cell's symbol is right, in reading order
     corrected_cells: tuple[int, ...] = ()  # cells whose symbol came from error correction or from the codebook
+    is_registered: bool = False  # a registered plate nearby has these digits
     # the codebook decided, or confirmed digits that the frame alone may have been too unsure to give
     from_codebook: bool = False
     geometry: PlateGeometry | None = None
@@ -294,7 +301,7 @@ class PlateReading:
     def certainty(self) -> Certainty | None:
         """How sure the digits are; None where there are none."""
         if self.code is not None:
-            return Certainty.SURE
+            return Certainty.SURE if self.is_registered or self.code.scheme.corrects else Certainty.UNCHECKED
         return Certainty.TENTATIVE if self.likely_code is not None else None
 
     @property

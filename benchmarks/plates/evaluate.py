@@ -11,6 +11,7 @@ import numpy as np
 
 from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.fit import FINE_CORNER_SCATTER
+from app.decoders.plate.paper import decode_plates_paper
 from app.decoders.plate.pose import camera_position_m, locate_moving_plate
 from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode
@@ -50,6 +51,9 @@ class Record:
     # `wrong`, `wrong_known`: digits returned as valid that are on no plate in the frame
     wrong: tuple[str, ...] = ()
     wrong_known: tuple[str, ...] = ()
+    # `decoded_paper`, `wrong_paper`: the same of the paper's own algorithm, in the trials
+    decoded_paper: bool = False
+    wrong_paper: tuple[str, ...] = ()
     tentative: bool = False  # its digits were returned as likely, from the frame alone
     wrong_tentative: tuple[str, ...] = ()  # likely digits that are on no plate in the frame
     # of each reading with digits or likely ones, from the frame alone: its confidence, whether it is sure, and whether
@@ -100,6 +104,8 @@ def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> tuple[Record, list[
     known = decode_plates(shot.frame.image, camera=shot.camera, codebook=shot.codebook, thermal=shot.thermal)
     hit, wrong = find_right(alone, shot.code, truth)
     hit_known, wrong_known = find_right(known, shot.code, truth)
+    by_paper = decode_plates_paper(shot.frame.image) if job.set_name == "trial" else []
+    hit_paper, wrong_paper = find_right(by_paper, shot.code, truth)
     likely = [r.likely_code.digits for r in alone if r.likely_code is not None]
     record = Record(
         set_name=job.set_name,
@@ -113,6 +119,8 @@ def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> tuple[Record, list[
         decoded_known=hit_known is not None,
         wrong=wrong,
         wrong_known=wrong_known,
+        decoded_paper=hit_paper is not None,
+        wrong_paper=wrong_paper,
         claims=tuple(
             (one.confidence, one.code is not None, shot.code is not None and shown.digits == shot.code.digits)
             for one in alone

@@ -60,7 +60,8 @@ THRESHOLDS = (
     Threshold(unit_likelihoods, "MAX_RESIDUAL_SPREAD", math.inf),
     Threshold(unit_likelihoods, "STAIN_UNIT_PX", 1e-9),
     Threshold(reader, "ORIENTATION_EVIDENCE", 0.0),
-    Threshold(detect_thermal, "MIN_MISFIT_RATIO", 1.0),
+    Threshold(detect_thermal, "MAX_MARKER_MISFIT", math.inf),
+    Threshold(detect_thermal, "MIN_TWO_LEVEL", 0.0),
 )
 
 

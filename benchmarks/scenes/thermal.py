@@ -82,6 +82,7 @@ class ThermalSensor:
     netd_k: float = 0.06  # [K] noise, and a tenth of it as fixed stripes of columns
     span_k: float = 25.0  # [K] Temperatures that the 256 grey levels cover
     road_k: float = 0.8  # [K] standard deviation of the road's own differences
+    road_level: float = 85.5  # [grey levels] of the road's mean: a third of the range, so that warm things fit in
     jpeg_quality: int | None = None  # None keeps the frame as it is
 
 
@@ -132,8 +133,8 @@ def _road(
 
 
 def _grey(temperature: Floats32, sensor: ThermalSensor, rng: np.random.Generator) -> Image:
-    """Noise and the linear range of grey levels, the road's mean at a third of it."""
+    """Noise and the linear range of grey levels."""
     noise = rng.standard_normal(temperature.shape, dtype=np.float32)
     stripes = 0.1 * rng.standard_normal((1, temperature.shape[1]), dtype=np.float32)
     noisy = temperature + np.float32(sensor.netd_k) * (noise + stripes)
-    return np.asarray(np.clip(85.5 + noisy * (255 / sensor.span_k), 0, 255), np.uint8)
+    return np.asarray(np.clip(sensor.road_level + noisy * (255 / sensor.span_k), 0, 255), np.uint8)

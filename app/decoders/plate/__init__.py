@@ -10,4 +10,6 @@ from typing import Any
 import numpy.typing as npt
 
 DECODER_VERSION = "plate/7"
+PAPER_VERSION = "plate-paper/1"
+"""Of `paper.decode_plates_paper`, the paper's own algorithm."""
 Array = npt.NDArray[Any]  # of whatever numbers

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from app.decoders.plate import Array
-from app.decoders.plate.confirm import UnitVerification
+from app.decoders.plate.confirm import UnitVerification, with_unseen_damage
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
 from app.decoders.plate.marker_colours import MarkerColours
 from app.decoders.plate.unit_likelihoods import UnitEvidence
@@ -123,13 +123,17 @@ def read_evidence(
         unit_log_likelihoods=found.log_likelihoods if found is not None else None,
     )
     if decoded.code is not None and (settled or refusal is None):
-        return replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason=""), decoded
+        read = replace(
+            reading, outcome=PlateOutcome.READ, code=decoded.code, reason="", is_registered=decoded.confirmed
+        )
+        return with_unseen_damage(read), decoded
     if lacking is None and not thermal:
         reading = _tentative(reading, decoded)
     if decoded.code is None or refusal is None:
         refusal = evidence.missing or _undecoded(decoded)
     outcome, reason = refusal
-    return replace(reading, outcome=outcome, reason=reason), decoded
+    confidence = 0.0 if reading.likely_code is None else reading.confidence  # of no digits, none are right
+    return replace(reading, outcome=outcome, reason=reason, confidence=confidence), decoded
 
 
 def _tentative(reading: PlateReading, decoded: DecodedSymbols) -> PlateReading:

@@ -474,6 +474,13 @@ def finish_fit(image: Array, coarse: CoarseFit, geometry: PlateGeometry, *, line
     return _result(model, covariance, equations.misfit, quality) if covariance.size else None
 
 
+def refit_plate(image: Array, fit: PlateFit, geometry: PlateGeometry, *, linear: bool = False) -> PlateFit | None:
+    """Second stage of `fit_plate` from a fit in another version of the image, whose model stays as it is."""
+    model = fit.model._replace(pose=fit.model.pose.copy(), values=fit.model.values.copy())
+    coarse = CoarseFit(model, _empty_equations(geometry.n, len(model.values)), fit.explained)
+    return finish_fit(image, coarse, geometry, linear=linear)
+
+
 def _run_stage(image: Array, model: PlateModel, equations: NormalEquations, stage: Stage, linear: bool) -> FitQuality:
     """Cut the plate out of the image where the model has it, and move the model until its corners rest."""
     lost = FitQuality(False, 0.0, 0.0, 0)

@@ -20,7 +20,7 @@ from app.decoders.plate.confirm import UnitVerification
 from app.decoders.plate.decode_symbols import DecodedSymbols
 from app.decoders.plate.detect_blobs import MarkerSignal, half_planes
 from app.decoders.plate.detect_quads import MarkerQuad
-from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, WarmFrame, fit_warm_plates, orientation_evidence
+from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, find_warm_plates
 from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evidence
 from app.decoders.plate.find_candidates import Candidate, find_candidates
 from app.decoders.plate.fit import PlateFit, finish_fit, fit_coarsely, project, refine_corners
@@ -231,31 +231,14 @@ class FrameReader:
         return found
 
     def read_warm(self) -> list[PlateInFrame]:
-        """Heated plates in a thermal frame, under one geometry after the other until one gives digits."""
+        """Plates that are warmer or colder than the road in a thermal frame."""
         found: list[PlateInFrame] = []
-        frame = WarmFrame(self._image)
-        for geometry in self._geometries:
-            for fits in fit_warm_plates(frame, geometry):
-                centre_px = fits[0].corners_px.mean(axis=0)
-                if fits[0].explained >= LIMITS.min_explained and not any(plate.covers(centre_px) for plate in found):
-                    found.append(self._read_orientations(fits, geometry))
-            if any(plate.reading.code for plate in found):
-                break
+        for warm in find_warm_plates(self._image, self._geometries):
+            plate = FittedPlate(self._image, warm.fit, warm.geometry)
+            unsure = PlateOutcome.RED_MARKER_MISSING, "the triangle cannot be distinguished from the squares"
+            missing = unsure if warm.orientation_evidence < ORIENTATION_EVIDENCE else None
+            found.append(self._read_plate(plate, plate.lacks_view() or missing))
         return found
-
-    def _read_orientations(self, fits: list[PlateFit], geometry: PlateGeometry) -> PlateInFrame:
-        """The likeliest orientation of a warm plate; another one only where the codebook confirms it."""
-        is_sure = orientation_evidence(fits) >= ORIENTATION_EVIDENCE
-        unsure = PlateOutcome.RED_MARKER_MISSING, "the triangle cannot be distinguished from the squares"
-        likeliest: PlateInFrame | None = None
-        for fit in fits if self._codebook else fits[:1]:
-            plate = FittedPlate(self._image, fit, geometry)
-            found = self._read_plate(plate, plate.lacks_view() or (None if is_sure and likeliest is None else unsure))
-            if found.reading.code is not None:
-                return found
-            likeliest = likeliest or found
-        assert likeliest is not None
-        return likeliest
 
     def _read_candidate(self, signal: MarkerSignal, candidate: Candidate) -> PlateInFrame | None:
         """A candidate under the geometry that explains most of its pixels; None when it is no plate."""

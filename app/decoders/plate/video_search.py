@@ -439,8 +439,8 @@ def _with_code(seen: SeenPlate, joint: PlateReading) -> SeenPlate:
     reading = replace(
         seen.reading, outcome=PlateOutcome.READ, code=joint.code, confidence=joint.confidence,
         cell_confidence=joint.cell_confidence, corrected_cells=joint.corrected_cells,
-        from_codebook=joint.from_codebook, pose=seen.pose, reason="", frames=joint.frames, likely_code=None,
-        doubtful_cells=(),
+        from_codebook=joint.from_codebook, is_registered=joint.is_registered, pose=seen.pose, reason="",
+        frames=joint.frames, likely_code=None, doubtful_cells=(),
     )  # fmt: skip
     return replace(seen, reading=reading)
 

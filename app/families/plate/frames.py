@@ -64,9 +64,14 @@ class PossibleSchemeDocument(TypedDict):
 class PlateReadingDocument(TypedDict):
     """A candidate plate in a frame and what was read from it.
 
-    `certainty` is `sure` with `digits`. It is `tentative` with `likely_digits`, which are too unsure to be matched or
-    to give a position, and `doubtful_cells`, the cells that may be wrong: other frames of an archive, or a registered
-    plate nearby, may confirm them. It is null where there are no digits.
+    `certainty` is `sure` with `digits` that Reed-Solomon checks or a registered plate nearby confirm, and `unchecked`
+    with others: a unit that peeled off or is taped over shows other digits in every frame, so `confidence` is at most
+    0.99. It is `tentative` with `likely_digits`, which are too unsure to be matched or to give a position, and
+    `doubtful_cells`, the cells that may be wrong: other frames of an archive, or a registered plate nearby, may confirm
+    them. It is null where there are no digits, and `confidence` is then 0.
+
+    `has_check` is whether the scheme of the digits has Reed-Solomon checks; the check digits of `position-check` do not
+    count, because a frame does not show that a plate has them.
 
     `scheme` is that of the registered plate nearby with these digits. Without one, `possible_schemes` has all schemes
     whose checks the digits satisfy: one check digit holds by accident for one `position` plate in ten, two for one in a
@@ -81,6 +86,7 @@ class PlateReadingDocument(TypedDict):
     likely_digits: str | None
     doubtful_cells: list[int]
     scheme: str | None
+    has_check: bool | None
     possible_schemes: list[PossibleSchemeDocument]
     registry_number: int | None
     confidence: float
@@ -161,6 +167,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
             "likely_digits": likely.digits if likely else None,
             "doubtful_cells": [int(cell) for cell in reading.doubtful_cells],
             "scheme": shown.scheme if shown else None,
+            "has_check": shown.scheme.corrects if shown else None,
             "possible_schemes": [
                 {"scheme": one.scheme, "check_digits": one.check_digits if one.scheme is checked else None}
                 for one in (_possible_codes(shown) if shown else ())

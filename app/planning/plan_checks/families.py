@@ -42,7 +42,7 @@ from app.planning.plan import (
     PlannedPlate,
     PlannedTag,
 )
-from app.planning.plate_view import camera_of, project_road
+from app.planning.predict.rates import camera_of, project_road
 from app.planning.radio_checks import (
     INTERVALS_S,
     EvenRoad,

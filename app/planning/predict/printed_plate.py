@@ -19,7 +19,6 @@ from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.print_grade import PrintPrediction
 from app.markers.reading import PlateOutcome, PlateReading
-from app.planning.plate_view import camera_of
 from app.planning.predict.rates import (
     DAY,
     FAR_M,
@@ -28,6 +27,7 @@ from app.planning.predict.rates import (
     CameraView,
     PlateModel,
     ViewReading,
+    camera_of,
     check_view_size,
     fitted_models,
     normal_quadrature,

@@ -21,7 +21,7 @@ from app.markers.magnet_design import Codebook
 from app.markers.reading import MarkerRow
 from app.planning.alignment import Lane
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
-from app.planning.plate_view import camera_of
+from app.planning.predict.rates import camera_of
 from app.planning.proof.drives import (
     ASIDE_M,
     AUDIBLE_M,

@@ -13,7 +13,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from app import __version__
-from app.decoders.plate import DECODER_VERSION
+from app.decoders.plate import DECODER_VERSION, PAPER_VERSION
 from app.decoding.frames import Fix, Match
 from app.errors import WaymarkError
 from app.families import get_family, union_of_documents
@@ -32,7 +32,6 @@ if TYPE_CHECKING:  # it loads numba
     from app.decoders.plate.video_search import FoundPlate
 
 _PLACES = {"lon_deg": 9, "lat_deg": 9, "speed_m_s": 3}
-DECODER = f"waymark {__version__} {DECODER_VERSION}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,13 +208,13 @@ class FramesResult(TypedDict, total=False):
 
 
 def frames_result(
-    frames: Sequence[ReadFrame], *, codebook_plates: int, notes: DriveNotes | None = None
+    frames: Sequence[ReadFrame], *, codebook_plates: int, notes: DriveNotes | None = None, is_paper: bool = False
 ) -> FramesResult:
     """The result of decoding frames, as it is stored."""
     notes = notes or DriveNotes()
     readings = [{"frame": frame.index, **_reading(marker)} for frame in frames for marker in frame.markers]
     return {
-        "decoder": DECODER,
+        "decoder": f"waymark {__version__} {PAPER_VERSION if is_paper else DECODER_VERSION}",
         "codebook_plates": codebook_plates,
         "summary": _summary(frames, notes.searched),
         "readings": readings,

@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.pose import locate_moving_plate, with_pose
 from app.decoding.declarations import CoarsePosition, DeclaredFrames, DecodeContext
-from app.decoding.frames import Match, fix_from_match, fuse_fixes, with_registered_size
+from app.decoding.frames import Match, PlateSearch, fix_from_match, fuse_fixes, with_registered_size
 from app.errors import ProcessStopped, Unavailable, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.families import get_family
 from app.families.family import FrameReading
@@ -58,9 +58,12 @@ class FrameSignal:
     result: FrameResult
 
 
-def search_for(nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:
-    """What to look for in a frame of this camera."""
+def search_for(nearby: NearbyMarkers, camera: Camera | None, *, is_paper: bool = False) -> FrameSearch:
+    """What to look for in a frame of this camera; for plates by the paper's own algorithm, if wanted."""
     searches = {name: reader.search(nearby.of(name), camera) for name, reader in FRAME_READERS.items()}
+    plates = searches[PLATE.name]
+    if is_paper and isinstance(plates, PlateSearch):
+        searches[PLATE.name] = replace(plates, is_paper=True)
     return {name: search for name, search in searches.items() if search is not None}
 
 
@@ -103,14 +106,14 @@ class FrameHandler(UploadHandler[FrameSignal]):
         with cancelled_on_error(pending):
             with self._database.read() as connection:
                 nearby = find_nearby_markers(connection, upload.agency_id, moment.context.coarse_position)
-            search.set_result(search_for(nearby, camera))
+            search.set_result(search_for(nearby, camera, is_paper=context.is_paper))
         return PendingSignal(pending, partial(FrameSignal, nearby))
 
     def match(self, connection: sa.Connection, upload: Upload, signal: FrameSignal) -> Decoded:
         """Match the frame's readings."""
         moment = _moment(upload.context, signal.result.header)
         frame = read_frame(connection, upload, Member(0, ""), signal.result, signal.nearby, moment)
-        return decoded_frames([frame], len(signal.nearby.codebook), upload.observed_at)
+        return decoded_frames([frame], len(signal.nearby.codebook), upload)
 
 
 def _moment(context: DecodeContext, header: ImageHeader) -> FrameMoment:
@@ -163,6 +166,8 @@ def read_frame(
         reading = found
         if match is not None and isinstance(found, PlateReading):
             reading = with_registered_size(found, match, camera)
+            if match.row is not None and match.plausible:
+                reading = replace(reading, is_registered=True)
         reading = at_middle_row(reading, camera, speed_m_s)
         fix = None
         if match is not None and camera is not None:
@@ -200,11 +205,12 @@ def at_middle_row(reading: FrameReading, camera: Camera | None, speed_m_s: float
 
 
 def decoded_frames(
-    frames: Sequence[ReadFrame], codebook_plates: int, observed_at: datetime, notes: DriveNotes | None = None
+    frames: Sequence[ReadFrame], codebook_plates: int, upload: Upload, notes: DriveNotes | None = None
 ) -> Decoded:
-    """Frames that were matched, ready to be stored."""
-    document = frames_result(frames, codebook_plates=codebook_plates, notes=notes)
-    observations = [*_observations(frames, observed_at), *missed_observations(frames, observed_at)]
+    """Frames that were matched, ready to be stored. What the paper's algorithm misses is no evidence about a marker."""
+    is_paper, at = upload.context.is_paper, upload.observed_at
+    document = frames_result(frames, codebook_plates=codebook_plates, notes=notes, is_paper=is_paper)
+    observations = [*_observations(frames, at), *(() if is_paper else missed_observations(frames, at))]
     return Decoded(document, observations, unregistered=unregistered_readings(frames))
 
 
@@ -277,7 +283,7 @@ class ArchiveHandler(UploadHandler[ArchiveSignal]):
 
     def match(self, connection: sa.Connection, upload: Upload, signal: ArchiveSignal) -> Decoded:
         """Collect the frames, which were matched as they came."""
-        return decoded_frames(signal.frames, signal.codebook_plates, upload.observed_at, signal.notes)
+        return decoded_frames(signal.frames, signal.codebook_plates, upload, signal.notes)
 
 
 def _check_holds_frames(file: SpooledFile) -> None:
@@ -375,7 +381,7 @@ class PendingArchive:
     def _look_for(self, nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:
         """The same object for frames that share it, so that a run has it once."""
         if self._search is None or self._search[0] is not nearby or self._search[1] != camera:
-            self._search = nearby, camera, search_for(nearby, camera)
+            self._search = nearby, camera, search_for(nearby, camera, is_paper=self._upload.context.is_paper)
         return self._search[2]
 
     def _markers_near(self, position: CoarsePosition | None) -> NearbyMarkers:
@@ -408,7 +414,8 @@ class PendingArchive:
         if now - self._part_at >= PART_EVERY:
             self._part_at = now
             notes = DriveNotes(self._places.warnings)
-            part = frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes)
+            is_paper = self._upload.context.is_paper
+            part = frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes, is_paper=is_paper)
         self._upload.report(done, total, part)
 
     def _confirm(self) -> None:

@@ -13,6 +13,7 @@ import sqlalchemy as sa
 
 from app.decoding.declarations import MAX_ACCURACY_M, CoarsePosition, DeclaredFrames, DecodeContext
 from app.decoding.frames import Nearby, distance_to_row
+from app.errors import InvalidParameter
 from app.families.family import FrameReading
 from app.formats.format import ArchiveLimits, Member, SpooledFile
 from app.formats.images import ImageHeader, ImageKind
@@ -103,7 +104,7 @@ class VideoHandler(UploadHandler[VideoSignal]):
 
     def match(self, connection: sa.Connection, upload: Upload, signal: VideoSignal) -> Decoded:
         """Collect the frames, which were matched as they came."""
-        return decoded_frames(signal.frames, len(signal.codebook), upload.observed_at, signal.notes)
+        return decoded_frames(signal.frames, len(signal.codebook), upload, signal.notes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +158,13 @@ class PendingVideo:
     def _index(self) -> VideoIndex:
         upload, wait_s = self._upload, self._upload.wait_s
         context, declared = upload.context, upload.context.frames or DeclaredFrames()
+        if context.is_paper:
+            raise InvalidParameter(
+                "the method paper reads pictures, not videos",
+                field="frames.method",
+                limit="waymark for a video",
+                cure="send the frames as a ZIP of pictures, or leave frames.method out",
+            )
         kind = _kind_of(context, upload.file)
         if kind is None:
             packed = open_packed_video(upload.file, self._rules.archives)

@@ -17,8 +17,7 @@ from app.families.plate.plates import PLATE
 from app.families.surveys import RETIRED
 from app.geodesy import decimal_year, enu_from_wgs84
 from app.markers.reading import MarkerRow, PlateOutcome, PlatePose, horizontal_rmse_m, marker_at
-from app.planning.plate_view import unit_heights_px
-from app.planning.predict.rates import DAY, fitted_models, normal_quadrature
+from app.planning.predict.rates import DAY, fitted_models, normal_quadrature, unit_heights_px
 from app.registry.decodes import NewObservation
 from app.registry.health import NewUnregistered
 from app.sensors.camera import Camera

@@ -3349,6 +3349,11 @@ export interface components {
             warnings?: "store" | "refuse";
         };
         DeclaredFrames: {
+            /**
+             * @default waymark
+             * @enum {string}
+             */
+            method?: "waymark" | "paper";
             /** @default null */
             poses?: components["schemas"]["PoseDeclaration"] | null;
             /** @default null */
@@ -5524,6 +5529,7 @@ export interface components {
             from_codebook: boolean;
             geometry: components["schemas"]["ReadGeometryDocument"] | null;
             grade: components["schemas"]["PlateGrade"] | null;
+            has_check: boolean | null;
             height_px: number;
             likely_digits: string | null;
             match: components["schemas"]["MatchDocument"] | null;

@@ -19,10 +19,11 @@ export function Readings({ readings, image }) {
 /** @param {{ reading: any, image: HTMLImageElement | null }} props */
 function Reading({ reading, image }) {
   const { match, grade } = reading;
-  const level = reading.outcome === "read" ? "good" : reading.outcome === "unsure" ? "warn" : "bad";
+  const shown = reading.certainty === "unchecked" ? "unchecked" : reading.outcome;
+  const level = shown === "read" ? "good" : shown === "unsure" || shown === "unchecked" ? "warn" : "bad";
   return html`
     <article class="reading">
-      <h3><${Verdict} level=${level}>${textOr(`outcome.${reading.outcome}`, reading.outcome)}</${Verdict}> <span class="code">${reading.digits}</span></h3>
+      <h3><${Verdict} level=${level}>${textOr(`outcome.${shown}`, shown)}</${Verdict}> <span class="code">${reading.digits}</span></h3>
       <${Facts} of=${[
         [t("field.reason"), reading.reason],
         [t("decode.confidence"), `${number(100 * reading.confidence, 3, "%")}${reading.from_codebook ? `, ${t("decode.from_registered")}` : ""}`],

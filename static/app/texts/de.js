@@ -1457,6 +1457,7 @@ export default {
   "outcome.received": "empfangen",
   "outcome.red-marker-missing": "rotes Dreieck fehlt",
   "outcome.refused": "abgelehnt",
+  "outcome.unchecked": "gelesen, ohne Prüfung",
   "outcome.unsure": "unsicher",
   "outcome.vertices-beyond-markers": "Ecken jenseits der Markierungen",
 

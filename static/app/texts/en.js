@@ -1457,6 +1457,7 @@ export default {
   "outcome.received": "received",
   "outcome.red-marker-missing": "red triangle is missing",
   "outcome.refused": "refused",
+  "outcome.unchecked": "read, without a check",
   "outcome.unsure": "unsure",
   "outcome.vertices-beyond-markers": "corners beyond the markers",
 

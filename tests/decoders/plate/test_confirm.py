@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.decoders.plate.confirm import MAX_JOINT_ERROR, UnitVerification, confirm_frames
+from app.decoders.plate.confirm import MAX_JOINT_ERROR, UNCHECKED_CONFIDENCE, UnitVerification, confirm_frames
 from app.decoders.plate.evidence import MAX_ERROR, MAX_TENTATIVE_ERROR
 from app.markers.plate import PlateCode
 from app.markers.reading import Certainty, PlateOutcome, PlateReading
@@ -39,7 +39,10 @@ def sure(code: PlateCode = CODE, height_px: float = 36.0) -> PlateReading:
 
 
 def test_the_certainty_follows_from_the_digits() -> None:
-    assert (sure().certainty, tentative().certainty) == (Certainty.SURE, Certainty.TENTATIVE)
+    assert (sure().certainty, tentative().certainty) == (Certainty.UNCHECKED, Certainty.TENTATIVE)
+    assert replace(sure(), is_registered=True).certainty is Certainty.SURE
+    checked = PlateCode.from_registry_number(0xDEADBEEF)
+    assert replace(sure(), code=checked).certainty is Certainty.SURE
     assert tentative().digits is None
     assert PlateReading(PlateOutcome.UNSURE).certainty is None
 
@@ -53,7 +56,8 @@ def test_evidence_that_is_too_weak_in_one_frame_adds_up_over_three() -> None:
     for [reading] in confirmed.values():
         assert (reading.outcome, reading.code, reading.likely_code) == (PlateOutcome.READ, CODE, None)
         assert reading.frames == (4, 7, 8)
-        assert reading.confidence > 1 - MAX_JOINT_ERROR
+        assert reading.certainty is Certainty.UNCHECKED  # tape is in all of them
+        assert reading.confidence == UNCHECKED_CONFIDENCE
         assert reading.doubtful_cells == ()
 
 

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from app.decoders.plate.confirm import UNCHECKED_CONFIDENCE
 from app.decoders.plate.reader import decode_plates
 from app.errors import InvalidParameter
 from app.formats.images import load_image
 from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode, PlateGeometry, PlateScheme
-from app.markers.reading import PlateOutcome, PlateReading
+from app.markers.reading import Certainty, PlateOutcome, PlateReading
 from app.sensors.camera import Camera
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import BACKGROUNDS, CAMERA, PAPER, face_of, photo, road, shoot, shoot_plate
@@ -74,7 +75,8 @@ def test_every_size_and_scheme_is_read(code: PlateCode) -> None:
         assert reading.code.registry_number == code.registry_number
     if code.scheme.corrects:
         assert reading.code == code  # without a word about its scheme
-    assert reading.confidence > 0.99
+    assert reading.confidence > 0.99 if code.scheme.corrects else reading.confidence == UNCHECKED_CONFIDENCE
+    assert reading.certainty is (Certainty.SURE if code.scheme.corrects else Certainty.UNCHECKED)
     assert len(reading.cell_confidence) == len(code.digits)
     assert reading.grade is not None
     assert reading.grade.letter in "ABCDF"
@@ -85,6 +87,8 @@ def test_the_codebook_tells_the_scheme_that_digits_cannot() -> None:
     reading = only(decode_plates(shoot_plate(code).image, codebook=[PAPER, code]))
     assert reading.code == code
     assert not reading.from_codebook  # the frame alone was enough
+    assert reading.certainty is Certainty.SURE
+    assert reading.confidence > UNCHECKED_CONFIDENCE
 
 
 def test_a_plate_of_other_dimensions_is_read_when_its_geometry_is_named() -> None:

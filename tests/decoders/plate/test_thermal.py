@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from app.decoders.plate.detect_thermal import _quad_around, without_trail
+from app.decoders.plate.detect_thermal import detect_warm_quads, find_warm_plates, without_trail
 from app.decoders.plate.reader import decode_plates
-from app.markers.plate import PlateCode
+from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.markers.reading import PlateOutcome
 from benchmarks.plates.sets import Job, Shot, find_shot, shoot
 from tests.decoders.plate.scenes import PAPER, THERMAL_CAMERA, shoot_warm
@@ -46,18 +46,29 @@ def test_a_warm_patch_of_one_level_is_no_plate_of_zeros() -> None:
     assert digits <= {None, shot.code.digits if shot.code else None}
 
 
-def test_warm_and_cold_are_not_exchanged() -> None:
-    inverted = 255 - shoot_warm(PAPER, 0.0).image
+@pytest.mark.parametrize("code", CODES, ids=lambda code: code.digits)
+@pytest.mark.parametrize("turn_deg", [0.0, 200.0])
+def test_a_plate_that_is_colder_than_the_road_is_read(code: PlateCode, turn_deg: float) -> None:
+    inverted = 255 - shoot_warm(code, turn_deg).image
     readings = decode_plates(inverted, thermal=True)
-    assert [r.digits for r in readings if r.outcome is PlateOutcome.READ] == []
+    assert [r.digits for r in readings if r.outcome is PlateOutcome.READ] == [code.digits]
 
 
-def test_a_warm_triangle_is_no_quadrangle() -> None:
-    legs = [(k, 0) for k in range(40)], [(0, 39 - k) for k in range(39)]
-    diagonal = [(39 - k, k) for k in range(1, 39)]
-    contour = np.array([*legs[0], *diagonal, *legs[1]], np.int32)[:, None]
-    assert len(cv2.convexHull(contour)) == 3
-    assert _quad_around(contour) is None
+def test_four_warm_squares_are_no_plate() -> None:
+    """Without a triangle there is no first corner, and no digits."""
+    image = shoot_warm(PAPER, 0.0).image
+    (plate,) = find_warm_plates(image, EXPECTED_GEOMETRIES)
+    corner, right, opposite, below = plate.fit.corners_px
+    middle = corner + 0.13 * ((right - corner) + (below - corner))
+    cv2.circle(image, middle.round().astype(int).tolist(), 5, int(image.max()), -1)
+    found = [r for r in decode_plates(image, thermal=True) if r.outcome is PlateOutcome.READ]
+    assert found == [] or (found[0].digits == PAPER.digits and opposite is not None)
+
+
+def test_a_warm_disc_is_no_quadrangle_of_units() -> None:
+    image = np.full((512, 640), 85, np.uint8)
+    cv2.circle(image, (320, 300), 40, 190, -1)
+    assert detect_warm_quads(image) == []
 
 
 def test_a_slow_sensor_s_trail_is_taken_off() -> None:
@@ -68,7 +79,8 @@ def test_a_slow_sensor_s_trail_is_taken_off() -> None:
     for row in range(58, -1, -1):  # the time before is below: the scene moves down
         seen[row] = (scene[row] + trail_px * seen[row + 1]) / (1 + trail_px)
     frame = np.round(40 + 160 * seen).astype(np.uint8)
-    sharp = without_trail(frame, trail_px).astype(float)
+    everywhere_px = np.array([(0.0, 8.0), (7.0, 8.0), (7.0, 52.0), (0.0, 52.0)])
+    sharp = without_trail(frame, everywhere_px, trail_px).astype(float)
     assert np.ptp(sharp[2:29]) < 0.05 * np.ptp(sharp)
     assert np.ptp(sharp[31:57]) < 0.05 * np.ptp(sharp)
     assert abs(float(sharp[31:57].mean() - sharp[2:29].mean())) > 0.9 * np.ptp(sharp)

@@ -15,7 +15,7 @@ from app.planning.placement import place_plan
 from app.planning.plan import Plan, PlanFinding, PlannedTag
 from app.planning.plan_checks import ExistingMarker, check_plan
 from app.planning.plan_checks.families import frames_per_pass, readable_zone_m
-from app.planning.plate_view import camera_of
+from app.planning.predict.rates import camera_of
 from app.planning.rules import CameraRules, PlanRules
 from tests.planning.roads import bend, opposite, road, straight
 
