@@ -166,6 +166,7 @@ def _joint_units(units: Sequence[UnitEvidence], share: float, max_unit_px: float
         gap=float(np.median([one.gap for one in units])),
         span=float(np.median([one.span for one in units])),
         veils=units[0].veils,
+        risk_log_odds=np.mean([one.risk_log_odds for one in near], axis=0),
         veil_log_odds=units[0].veil_log_odds,
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 from app.decoders.plate import Array
 from app.decoders.plate.confirm import UnitVerification
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
-from app.decoders.plate.marker_colours import MarkerColours
+from app.decoders.plate.marker_colours import MarkerColours, count_clear
 from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
@@ -29,6 +29,9 @@ of `python -m benchmarks.plates trials` of 10 to 12 rows: below it the units are
 CLEAN_EXPLAINED = 0.93
 """[1] share of variance from which a word may be corrected without a registry. Effect: `python -m
 benchmarks.plates.thresholds`."""
+CLEAR_MARKERS, CLEAR_LOOK_ALIKES = 3, 0.1
+"""[markers, 1] clear markers from which on one may be hidden, and share of the look-alikes that have as many. Effect:
+`python -m benchmarks.plates false --sets look-alikes`."""
 MAX_ERROR = 1e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
 stains and in fair light (decision record 0011)."""
@@ -104,6 +107,7 @@ def read_evidence(
     decoded = decode_symbols(
         evidence.units, evidence.geometry.n, codebook, MIN_CONFIDENCE,
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
+        look_alikes=_look_alikes(evidence),
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
     )  # fmt: skip
     lacking = _find_lacking(evidence)
@@ -150,6 +154,12 @@ def _find_lacking(evidence: PlateEvidence) -> tuple[PlateOutcome, str] | None:
     if evidence.explained < (MIN_EXPLAINED_SMALL if evidence.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE):
         return PlateOutcome.UNSURE, "the plate's pattern explains too little of the image"
     return None
+
+
+def _look_alikes(evidence: PlateEvidence) -> float:
+    """Share of the look-alikes that show as much of a plate's grid and markers."""
+    has_markers = evidence.colours is not None and count_clear(evidence.colours) >= CLEAR_MARKERS
+    return CLEAR_LOOK_ALIKES if has_markers and evidence.explained >= MIN_EXPLAINED_ALONE else 1.0
 
 
 def _is_small(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:
