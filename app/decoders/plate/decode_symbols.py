@@ -330,7 +330,7 @@ def _correct_to_registered(
     """
     cells = _softmax_confidence(evidence.cell_costs, evidence.best.tolist())
     damaged = (cells < UNCERTAIN_CELL) | _outliers(evidence) | (evidence.best > 9)
-    scores = np.log(16 * _symbol_probabilities(evidence))
+    scores = np.log(16 * symbol_probabilities(evidence))
     changes = np.array([np.asarray(code.symbols) != evidence.best for code in known])
     for code, changed in zip(known, changes, strict=True):
         if code.scheme.corrects:
@@ -388,7 +388,7 @@ def _outliers(evidence: UnitEvidence) -> npt.NDArray[np.bool_]:
     return found
 
 
-def _symbol_probabilities(evidence: UnitEvidence) -> Array:
+def symbol_probabilities(evidence: UnitEvidence) -> Array:
     """Probability of each symbol of each cell, shape (cells, 16): by its units, unless damage hides what was built."""
     likelihood = np.exp(-0.5 * TEMPER * evidence.cell_costs)
     risk = 1 / (1 + np.exp(-evidence.risk_log_odds[:, None]))
@@ -397,32 +397,54 @@ def _symbol_probabilities(evidence: UnitEvidence) -> Array:
 
 
 def _decode_checked(evidence: UnitEvidence, n: int, clean: bool, look_alikes: float) -> DecodedSymbols:
-    """The likeliest codeword of a scheme with Reed-Solomon checks, and its probability.
+    """The likeliest codeword of a scheme with Reed-Solomon checks, and its probability."""
+    found = decode_word(symbol_probabilities(evidence), n)
+    if found is None:
+        return DecodedSymbols(None, 0.0, ())
+    confidence = found.confidence(RANDOM_PRIOR if clean else UNCLEAN_RANDOM_PRIOR * look_alikes)
+    is_checked = found.confidence(look_alikes) > 1 - MAX_CHECKED_ERROR
+    symbols = found.code.symbols
+    changed = tuple(i for i, (a, b) in enumerate(zip(evidence.best, symbols, strict=True)) if a != b)
+    cells = _softmax_confidence(evidence.cell_costs, symbols)
+    cells[list(changed)] = confidence
+    return DecodedSymbols(found.code, confidence, _floats(cells), changed, checked=is_checked)
 
-    The error probability is that of another codeword of the scheme, of another scheme, or of random symbols, such as
-    those of a plate that is stained all over. Random symbols get a confidence of c with a probability of (1 - c) / c /
-    `RANDOM_PRIOR` at most (`LikelyCodeword.log_evidence`): 1/20 at `MIN_CONFIDENCE`.
+
+class CheckedWord(NamedTuple):
+    """The likeliest codeword of all schemes with Reed-Solomon checks."""
+
+    code: PlateCode
+    wrong: float  # [probability] that another codeword of its scheme is on the plate
+    log_evidence: float  # as of `LikelyCodeword`
+    log_rivals: float  # the same of the other schemes together
+
+    def confidence(self, random_prior: float) -> float:
+        """Probability of the code, where random symbols have these odds against a codeword of a scheme.
+
+        Such are those of a plate that is stained all over. They get a confidence of c with a probability of (1 - c) /
+        c / `random_prior` at most (`LikelyCodeword.log_evidence`): 1/20 at `MIN_CONFIDENCE` and `RANDOM_PRIOR`.
+        """
+        rival = float(np.logaddexp(self.log_rivals, math.log(random_prior)))
+        return (1 - self.wrong) / (1 + math.exp(min(rival - self.log_evidence, 700.0)))
+
+
+def decode_word(probabilities: Array, n: int) -> CheckedWord | None:
+    """The likeliest codeword of a scheme with Reed-Solomon checks; None where no scheme has any.
+
+    Parameters
+    ----------
+    probabilities : ndarray, shape (cells, 16)
+        Of the symbols of each cell.
     """
-    probabilities = _symbol_probabilities(evidence)
     found = [(scheme, likely_codeword(probabilities, n, scheme)) for scheme in PlateScheme if scheme.corrects]
     rivals: list[tuple[PlateScheme, LikelyCodeword]] = [(s, word) for s, word in found if word is not None]
     if not rivals:
-        return DecodedSymbols(None, 0.0, ())
+        return None
     scheme, best = max(rivals, key=lambda rival: rival[1].log_evidence)
     others = [word.log_evidence for _, word in rivals if word is not best]
     others.append(_decimal_evidence(probabilities, n))
-
-    def confidence_given(random_prior: float) -> float:
-        rival = float(np.logaddexp.reduce([*others, math.log(random_prior)]))
-        return (1 - best.wrong) / (1 + math.exp(min(rival - best.log_evidence, 700.0)))
-
-    confidence = confidence_given(RANDOM_PRIOR if clean else UNCLEAN_RANDOM_PRIOR)
-    is_checked = confidence_given(look_alikes) > 1 - MAX_CHECKED_ERROR
-    changed = tuple(i for i, (a, b) in enumerate(zip(evidence.best, best.symbols, strict=True)) if a != b)
-    cells = _softmax_confidence(evidence.cell_costs, best.symbols)
-    cells[list(changed)] = confidence
     code = PlateCode.from_symbols(best.symbols, scheme, n)
-    return DecodedSymbols(code, confidence, _floats(cells), changed, checked=is_checked)
+    return CheckedWord(code, best.wrong, best.log_evidence, float(np.logaddexp.reduce(others)))
 
 
 def _decimal_evidence(probabilities: Array, n: int) -> float:

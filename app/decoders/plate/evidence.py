@@ -10,11 +10,11 @@ import numpy as np
 
 from app.decoders.plate import Array
 from app.decoders.plate.confirm import UnitVerification
-from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
+from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols, symbol_probabilities
 from app.decoders.plate.marker_colours import MarkerColours, count_clear
 from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.markers.plate import PlateCode, PlateGeometry
-from app.markers.reading import PlateOutcome, PlateReading
+from app.markers.reading import PlateOutcome, PlateReading, SymbolEvidence
 
 MIN_CONFIDENCE = 0.9995
 """[probability] from which digits are returned. Source: no wrong digits (decision record 0010, rule 5)."""
@@ -103,11 +103,11 @@ def read_evidence(
         Compares the pixels with a code that the registry does not confirm, where something on the plate is unusual;
         where it cannot, the units decide.
     """
-    thermal = evidence.thermal
+    thermal, look_alikes = evidence.thermal, _look_alikes(evidence)
     decoded = decode_symbols(
         evidence.units, evidence.geometry.n, codebook, MIN_CONFIDENCE,
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
-        look_alikes=_look_alikes(evidence),
+        look_alikes=look_alikes,
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
     )  # fmt: skip
     lacking = _find_lacking(evidence)
@@ -125,6 +125,7 @@ def read_evidence(
         corrected_cells=decoded.corrected,
         from_codebook=decoded.from_codebook or (decoded.confirmed and not decoded.checked and is_unsure_alone),
         unit_log_likelihoods=found.log_likelihoods if found is not None else None,
+        symbols=None if thermal else SymbolEvidence(np.log(16 * symbol_probabilities(evidence.units)), look_alikes),
     )
     if decoded.code is not None and (settled or refusal is None):
         return replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason=""), decoded
