@@ -305,6 +305,13 @@ class PlateReading:
             return Certainty.SURE
         return Certainty.TENTATIVE if self.likely_code is not None else None
 
+    def is_at(self, other: PlateReading) -> bool:
+        """Whether the middle of this plate's image lies within the extent of the other's."""
+        if self.corners_px is None or other.corners_px is None:
+            return False
+        middle, low, high = self.corners_px.mean(axis=0), other.corners_px.min(axis=0), other.corners_px.max(axis=0)
+        return bool(((middle > low) & (middle < high)).all())
+
     @property
     def digits(self) -> str | None:
         """Digits as read, None unless the outcome is READ."""

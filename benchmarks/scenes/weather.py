@@ -159,7 +159,9 @@ def _at_dusk(conditions: Conditions, rng: np.random.Generator) -> Conditions:
 
 
 def _draw_lamp(rng: np.random.Generator) -> MirroredLamp:
-    colour = np.array(_LAMPS[int(rng.integers(len(_LAMPS)))]) * float(np.exp(rng.uniform(math.log(0.08), math.log(0.6))))
+    colour = np.array(_LAMPS[int(rng.integers(len(_LAMPS)))]) * float(
+        np.exp(rng.uniform(math.log(0.08), math.log(0.6)))
+    )
     blue, green, red = (float(v) for v in colour)
     return MirroredLamp(
         (blue, green, red),

@@ -241,19 +241,24 @@ def confirm_drive(frames: Sequence[tuple[int, Sequence[PlateReading]]]) -> dict[
         if found is None:
             continue
         code, confidence = found
-        cells = np.arange(len(code.symbols))
-        shown = [one.symbols is not None and float(one.symbols.scores[cells, code.symbols].sum()) >= MIN_SHOWN_LOG_ODDS
-                 for one in seen.readings]  # fmt: skip
-        numbers = tuple(known[frame][0] for (frame, _place), is_shown in zip(seen.places, shown, strict=True) if is_shown)
-        for (frame, place), reading, is_shown in zip(seen.places, seen.readings, shown, strict=True):
-            if is_shown and reading.code is None:
-                number, readings = known[frame]
+        shown = [place for place, one in zip(seen.places, seen.readings, strict=True) if _shows_code(one, code)]
+        numbers = tuple(known[frame][0] for frame, _place in shown)
+        for frame, place in shown:
+            number, readings = known[frame]
+            if readings[place].code is None:
                 readings[place] = replace(
-                    reading, outcome=PlateOutcome.READ, code=code, likely_code=None, doubtful_cells=(),
+                    readings[place], outcome=PlateOutcome.READ, code=code, likely_code=None, doubtful_cells=(),
                     confidence=confidence, reason="", frames=numbers,
                 )  # fmt: skip
                 changed[number] = readings
     return changed
+
+
+def _shows_code(reading: PlateReading, code: PlateCode) -> bool:
+    """Whether a frame's own symbols are likelier to be the code's than random."""
+    assert reading.symbols is not None
+    scores = reading.symbols.scores
+    return float(scores[np.arange(len(scores)), code.symbols].sum()) >= MIN_SHOWN_LOG_ODDS
 
 
 def _follow_symbols(frames: Sequence[tuple[int, Sequence[PlateReading]]]) -> list[_SeenSymbols]:

@@ -107,8 +107,8 @@ STAIN_DARK, STAIN_LIGHT = 0.07, 0.105
 MIN_OF_A_LEVEL = 6
 """[units] light or dark ones from which on their median is the usual residual."""
 RISK_CONSTANT, RISK_OF_LEVEL, RISK_OF_MISFIT, RISK_BESIDE_HIDDEN = -0.765, 1.98, 1.877, 2.289
-"""[log odds] that a cell shows another symbol than was built: alone, for the logarithms of its level residual and of its
-pixels' misfit, and beside a marker that is hidden. Source: logistic regression over 9,570 cells of `id` and
+"""[log odds] that a cell shows another symbol than was built: alone, for the logarithms of its level residual and of
+its pixels' misfit, and beside a marker that is hidden. Source: logistic regression over 9,570 cells of `id` and
 `position-robust` plates in weather, shade, glare, stains and wear (decision record 0008)."""
 RISK_FLOOR = 0.05
 """[contrast] added to a level residual before its logarithm."""
