@@ -193,8 +193,8 @@ def _draw_snow(rng: np.random.Generator) -> Layer:
     inside = np.full((size, size), -1e9)
     for left, top, radius in patches:
         wide = float(rng.uniform(0.75, 1.3))
-        away = np.hypot((x - left) * wide, (y - top) / wide)
-        inside = np.maximum(inside, radius - away + 0.8 * radius * ragged)
+        distance = np.hypot((x - left) * wide, (y - top) / wide)
+        inside = np.maximum(inside, radius - distance + 0.8 * radius * ragged)
     softness = float(rng.uniform(0.002, 0.012))
     opacity = float(rng.uniform(0.9, 1.0)) / (1 + np.exp(np.clip(-inside / softness, -40, 40)))
     dusting = float(rng.uniform(0, 0.12)) * smooth_noise((size, size), 60 / TEXEL_MM, rng)

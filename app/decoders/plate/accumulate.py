@@ -216,7 +216,8 @@ class _SeenSymbols:
     def scores(self) -> Array:
         """Joint log of 16 times the probability of each symbol, shape (cells, 16); as `count_effective` frames."""
         weight = count_effective(len(self.readings)) / len(self.readings)
-        return _normalized(weight * sum(one.symbols.scores for one in self.readings if one.symbols is not None))
+        scores = np.array([one.symbols.scores for one in self.readings if one.symbols is not None])
+        return _normalized(weight * scores.sum(axis=0))
 
     @property
     def code(self) -> PlateCode | None:

@@ -132,8 +132,8 @@ def candidate_log_odds(signal: MarkerSignal, quads: Sequence[MarkerQuad], geomet
     features[:, WEAKEST_MARGIN] = features[:, WEAKEST_MARGIN + 1]
     features[:, WEAKEST_TINT] = features[:, SECOND_TINT]
     hidden = features @ WEIGHTS[:-1] + WEIGHTS[-1] + HIDDEN_LOG_ODDS
-    log_odds = np.logaddexp(seen, hidden)
-    return np.where(np.isfinite(log_odds), log_odds, -np.inf)
+    seen, hidden = (np.where(np.isfinite(log_odds), log_odds, -np.inf) for log_odds in (seen, hidden))
+    return np.logaddexp(seen, hidden)
 
 
 def size_misfit(quad: MarkerQuad, geometry: PlateGeometry) -> float:
