@@ -8,7 +8,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
 from app.compiled import ieee_kernel, ieee_loop, ieee_loop_kernel, kernel, step, trailing_zeros
 from app.decoders.plate import Array
@@ -137,9 +136,12 @@ def _ratio(green: Grey, red: Grey, opponent: Signal) -> None:
 
 
 def _median_along_columns(means: Signal) -> Signal:
-    """Median of each block and the two above and below."""
+    """Median of each block and the two above and below, by comparing whole rows, which is faster than sorting."""
     padded = np.pad(means, ((2, 2), (0, 0)), mode="edge")
-    return np.asarray(np.sort(sliding_window_view(padded, 5, axis=0), axis=-1)[..., 2], np.int16)
+    a, b, c, d, e = (padded[k : k + len(means)] for k in range(5))
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    return np.asarray(np.maximum(np.minimum(low, high), np.minimum(e, np.maximum(low, high))), np.int16)
 
 
 @ieee_kernel
