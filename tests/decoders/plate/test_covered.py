@@ -146,6 +146,7 @@ def test_a_plate_without_colours_is_found_where_another_frame_places_it() -> Non
     assert found is not None
     assert (found.digits, found.frames, found.from_codebook) == (CODE.digits, (7,), False)
     assert found.pose is not None
+    assert found.corners_px is not None
     assert np.abs(found.corners_px - far.truths[0].corners_px).max() < 1.5
     # neither a plate with another code nor the empty road is taken for it
     other = shoot(PlacedFace(face_of(OTHER), AHEAD_M + 0.7)).image
