@@ -264,6 +264,13 @@ class PlateGrade:
     unused_correction: float
 
 
+class SymbolEvidence(NamedTuple):
+    """What a frame shows of the symbols of a plate: other frames of the plate are added to it."""
+
+    scores: npt.NDArray[np.float64]  # shape (cells, 16): log of 16 times the probability of each symbol
+    look_alikes: float  # share of the look-alikes that show as much of a plate's grid and markers
+
+
 @dataclass(frozen=True, slots=True)
 class PlateReading:
     """One candidate plate in a frame and what was read from it."""
@@ -296,6 +303,7 @@ class PlateReading:
     # shape (units, 5), or None: of the hypotheses on each unit under the digits, where the frame's pixels were
     # compared: other frames of the plate are added to them
     unit_log_likelihoods: npt.NDArray[np.float64] | None = None
+    symbols: SymbolEvidence | None = None  # None where the units do not stand out of the noise, and of thermal frames
 
     @property
     def certainty(self) -> Certainty | None:
@@ -303,6 +311,13 @@ class PlateReading:
         if self.code is not None:
             return Certainty.SURE if self.is_registered or self.code.scheme.corrects else Certainty.UNCHECKED
         return Certainty.TENTATIVE if self.likely_code is not None else None
+
+    def is_at(self, other: PlateReading) -> bool:
+        """Whether the middle of this plate's image lies within the extent of the other's."""
+        if self.corners_px is None or other.corners_px is None:
+            return False
+        middle, low, high = self.corners_px.mean(axis=0), other.corners_px.min(axis=0), other.corners_px.max(axis=0)
+        return bool(((middle > low) & (middle < high)).all())
 
     @property
     def digits(self) -> str | None:

@@ -12,10 +12,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from app.decoders.plate.confirm import confirm_frames
+from app.decoders.plate.accumulate import confirm_drive
+from app.decoders.plate.confirm import DriveFrame, list_expected, with_expected
+from app.decoders.plate.follow_plate import expect_plate, find_expected
+from app.decoders.plate.pose import with_pose
 from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, recommended_geometry
 from app.markers.reading import PlateReading
+from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import draw_stress
 from app.simulation.plate_face import Face, plate_face
@@ -25,8 +29,9 @@ from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
 from benchmarks.plates.sets import draw_light, draw_scenes, draw_stress_views
 from benchmarks.plates.tables import table
 from benchmarks.plates.views import draw_background
+from benchmarks.scenes.weather import WEATHER, Weather, draw_weather
 
-SCHEME_SETS = ("fair", "shadow-edge", "dapple", "glare", "stains", "stained-shade", "worn", "stress")
+SCHEME_SETS = ("fair", "shadow-edge", "dapple", "glare", "stains", "stained-shade", "worn", "stress", *WEATHER)
 NEIGHBOURS = 20
 """[plates] of the registry within about 500 m of the plate, the plate among them."""
 
@@ -94,6 +99,7 @@ class SchemeRecord:
     tentative: Counts = Counts()  # frames whose digits were returned as likely, from the frame alone
     together: Counts = Counts()
     known: Counts = Counts()
+    known_together: Counts = Counts()  # with the registry and the drive's frames
     is_tag: bool = False
 
 
@@ -108,22 +114,25 @@ def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
     cv2.setNumThreads(1)
     rng = np.random.default_rng([drive.seed, 7, SCHEME_SETS.index(drive.set_name), drive.index])
     under_stress = drive.set_name == "stress"
-    conditions = draw_stress(rng) if under_stress else draw_light(drive.set_name, rng)
+    weather = _draw_weather(drive.set_name, rng)
+    conditions = weather.conditions
     stains = int(rng.integers(1 << 31))
     places = draw_places(rng)
     blank = Face(PlateGeometry().side_mm / 1000, np.zeros((2, 2, 3), np.float32))
     if under_stress:
         views = draw_stress_views(blank, conditions, rng)
     else:
-        scenes = draw_scenes(blank, conditions, rng)
+        scenes = [replace(s, night_light=conditions.night_light) for s in draw_scenes(blank, conditions, rng)]
         background = draw_background(scenes[0].camera, rng)
         views = [(scene, background) for scene in scenes]
     noise = [int(s) for s in rng.integers(1 << 31, size=len(views))]
 
     def frames(face: Face) -> Iterator[tuple[PlateScene, np.ndarray]]:
         for (scene, background), seed in zip(views, noise, strict=True):
-            placed = replace(scene, faces=(replace(scene.faces[0], face=face), *scene.faces[1:]))
-            yield placed, render_plate_scene(placed, background, np.random.default_rng(seed)).image
+            covered = replace(scene.faces[0], face=weather.on_face(face))
+            placed = weather.in_scene(replace(scene, faces=(covered, *scene.faces[1:])))
+            road = weather.on_road(placed, background)
+            yield placed, render_plate_scene(placed, road, np.random.default_rng(seed)).image
 
     records = []
     for candidate in CANDIDATES:
@@ -138,6 +147,13 @@ def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
     return records
 
 
+def _draw_weather(name: str, rng: np.random.Generator) -> Weather:
+    """Weather, or the light of a set in fair weather."""
+    if name in WEATHER:
+        return draw_weather(name, rng)
+    return Weather(draw_stress(rng) if name == "stress" else draw_light(name, rng))
+
+
 def draw_places(rng: np.random.Generator) -> list[tuple[float, float, int]]:
     """Longitude, latitude [deg] and number of a plate and of its neighbours."""
     lon, lat, number = float(rng.uniform(-180, 180)), float(rng.uniform(-85, 85)), int(rng.integers(1 << 32))
@@ -150,13 +166,14 @@ def draw_places(rng: np.random.Generator) -> list[tuple[float, float, int]]:
 def _read(
     drive: SchemeDrive, name: str, frames: Iterator[tuple[PlateScene, np.ndarray]], codes: Sequence[PlateCode]
 ) -> SchemeRecord:
-    truths, alone, known = [], [], []
+    truths, alone, known, images, cameras = [], [], [], [], []
     for scene, image in frames:
+        cameras.append(scene.camera)
+        images.append(image)
         truths.append(face_truth(scene, scene.faces[0]))
         alone.append(decode_plates(image, camera=scene.camera))
         known.append(decode_plates(image, camera=scene.camera, codebook=tuple(codes)))
-    confirmed = confirm_frames(list(enumerate(alone)))
-    together = [confirmed.get(k, readings) for k, readings in enumerate(alone)]
+    together = read_together(alone, images, cameras)
     likely = [[one.likely_code.digits for one in readings if one.likely_code is not None] for readings in alone]
     tentative = Counts(
         sum(codes[0].digits in shown for shown in likely),
@@ -164,8 +181,22 @@ def _read(
     )
     return SchemeRecord(
         drive, name, len(truths), _count(alone, codes[0], truths), tentative, _count(together, codes[0], truths),
-        _count(known, codes[0], truths),
+        _count(known, codes[0], truths), _count(read_together(known, images, cameras), codes[0], truths),
     )  # fmt: skip
+
+
+def read_together(
+    alone: Sequence[list[PlateReading]], images: Sequence[np.ndarray], cameras: Sequence[Camera]
+) -> list[list[PlateReading]]:
+    """What the frames of a drive show together, as an archive of them is read."""
+    confirmed = confirm_drive(list(enumerate(alone)))
+    together = [[with_pose(one, cameras[k]) for one in confirmed.get(k, readings)] for k, readings in enumerate(alone)]
+    expected = list_expected([DriveFrame(k, readings, cameras[k]) for k, readings in enumerate(together)])
+    for k, plates in expected.items():
+        wanted = [place for one in plates if (place := expect_plate(one, cameras[k])) is not None]
+        found = [one for place in wanted if (one := find_expected(images[k], place, cameras[k])) is not None]
+        together[k] = with_expected(together[k], found)
+    return together
 
 
 def _count(frames: Sequence[list[PlateReading]], code: PlateCode, truths: Sequence[FaceTruth]) -> Counts:
@@ -187,15 +218,19 @@ def schemes_table(records: Sequence[SchemeRecord]) -> str:
             place = f"{worst.alone.read} of {worst.frames}"
             head = (name, scheme, sum(r.frames for r in own))
             if own[0].is_tag:
-                rows.append((*head, sum(one.read for one in alone), "", "", "", place, _lost(alone)))
+                rows.append((*head, sum(one.read for one in alone), "", "", "", "", place, _lost(alone)))
                 continue
-            ways = (alone, [r.tentative for r in own], [r.together for r in own], [r.known for r in own])
+            ways = (
+                alone, [r.tentative for r in own], [r.together for r in own], [r.known for r in own],
+                [r.known_together for r in own],
+            )  # fmt: skip
             shown = (f"{sum(one.read for one in way)} / {sum(len(one.wrong) for one in way)}" for way in ways)
-            lost = " / ".join(_lost(ways[k]) for k in (0, 2, 3))
+            lost = " / ".join(_lost(ways[k]) for k in (0, 2, 3, 4))
             rows.append((*head, *shown, place, lost))
     titles = (
         "set", "scheme", "frames", "alone / wrong", "tentative / wrong", "with the drive's frames / wrong",
-        "with registry / wrong", "worst drive alone", "drives lost alone / with its frames / with registry",
+        "with registry / wrong", "with both / wrong", "worst drive alone",
+        "drives lost alone / with its frames / with registry / with both",
     )  # fmt: skip
     return table(titles, rows)
 
@@ -203,7 +238,9 @@ def schemes_table(records: Sequence[SchemeRecord]) -> str:
 def wrong_readings(records: Sequence[SchemeRecord]) -> Iterator[str]:
     """Sure readings that are on no plate, and where they were read."""
     for record in records:
-        for digits in (*record.alone.wrong, *record.together.wrong, *record.known.wrong):
+        for digits in (
+            *record.alone.wrong, *record.together.wrong, *record.known.wrong, *record.known_together.wrong,
+        ):  # fmt: skip
             yield f"{digits} of {record.name}, {record.drive}"
 
 

@@ -10,10 +10,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from app.decoders.plate import Array
+from app.decoders.plate.confirm import MAX_UNSEEN, confirm_frames
+from app.decoders.plate.decode_symbols import MAX_CHECKED_ERROR, decode_word
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
 from app.decoders.plate.marker_colours import MIN_MARGIN, find_wrong_colour
 from app.decoders.plate.pose import with_pose
@@ -26,7 +29,7 @@ from app.decoders.plate.unit_likelihoods import (
     level_residuals,
 )
 from app.decoders.plate.unit_patterns import cell_costs, minimize_pattern
-from app.markers.plate import PlateCode
+from app.markers.plate import SIZES, PlateCode, code_cells
 from app.markers.reading import PlateOutcome, PlateReading
 from app.sensors.camera import Camera
 
@@ -166,6 +169,7 @@ def _joint_units(units: Sequence[UnitEvidence], share: float, max_unit_px: float
         gap=float(np.median([one.gap for one in units])),
         span=float(np.median([one.span for one in units])),
         veils=units[0].veils,
+        risk_log_odds=np.mean([one.risk_log_odds for one in near], axis=0),
         veil_log_odds=units[0].veil_log_odds,
     )
 
@@ -190,3 +194,121 @@ def _usual_missing(evidence: Sequence[PlateEvidence]) -> tuple[PlateOutcome, str
         beside=float(np.median([one.beside for one in colours])),
     )
     return usual if joint.margins.min() < MIN_MARGIN else find_wrong_colour(joint)
+
+
+# === Frames of a drive that are decoded apart: readings of one plate, found by the symbols that they show.
+
+
+MIN_SAME_LOG_ODDS = math.log(100)
+"""[log odds] from which two readings are of one plate: that both show the same symbols, against unrelated ones."""
+MIN_SHOWN_LOG_ODDS = math.log(1e4)
+"""[log odds] from which a frame shows the code of its plate, against random symbols."""
+
+
+@dataclass(slots=True)
+class _SeenSymbols:
+    """Readings of one plate in frames in a row."""
+
+    places: list[tuple[int, int]]  # of the frame, and of the reading in it
+    readings: list[PlateReading]
+
+    @property
+    def scores(self) -> Array:
+        """Joint log of 16 times the probability of each symbol, shape (cells, 16); as `count_effective` frames."""
+        weight = count_effective(len(self.readings)) / len(self.readings)
+        scores = np.array([one.symbols.scores for one in self.readings if one.symbols is not None])
+        return _normalized(weight * scores.sum(axis=0))
+
+    @property
+    def code(self) -> PlateCode | None:
+        """That one of its frames shows alone."""
+        return next((one.code for one in self.readings if one.code is not None), None)
+
+
+def confirm_drive(frames: Sequence[tuple[int, Sequence[PlateReading]]]) -> dict[int, list[PlateReading]]:
+    """Readings that the frames of a drive give together, in the order in which they were taken.
+
+    Parameters and result as of `confirm_frames`, whose rule for digits without a check comes first. Then the symbols of
+    refused readings are added up, over the frames that show the same plate: by their probabilities, whatever their
+    digits. A code with checks is returned where its error probability is below `MAX_CHECKED_ERROR`, or a frame shows it
+    alone; in the frames that show it, that is whose own symbols are `MIN_SHOWN_LOG_ODDS` likelier than random ones.
+    """
+    changed = confirm_frames(frames)
+    known = [(number, changed.get(number, list(readings))) for number, readings in frames]
+    for seen in _follow_symbols(known):
+        if len(seen.readings) < 2 or all(one.code is not None for one in seen.readings):
+            continue
+        found = _joint_code(seen)
+        if found is None:
+            continue
+        code, confidence = found
+        shown = [place for place, one in zip(seen.places, seen.readings, strict=True) if _shows_code(one, code)]
+        numbers = tuple(known[frame][0] for frame, _place in shown)
+        for frame, place in shown:
+            number, readings = known[frame]
+            if readings[place].code is None:
+                readings[place] = replace(
+                    readings[place], outcome=PlateOutcome.READ, code=code, likely_code=None, doubtful_cells=(),
+                    confidence=confidence, reason="", frames=numbers,
+                )  # fmt: skip
+                changed[number] = readings
+    return changed
+
+
+def _shows_code(reading: PlateReading, code: PlateCode) -> bool:
+    """Whether a frame's own symbols are likelier to be the code's than random."""
+    assert reading.symbols is not None
+    scores = reading.symbols.scores
+    return float(scores[np.arange(len(scores)), code.symbols].sum()) >= MIN_SHOWN_LOG_ODDS
+
+
+def _follow_symbols(frames: Sequence[tuple[int, Sequence[PlateReading]]]) -> list[_SeenSymbols]:
+    """Readings with the same symbols in frames in a row."""
+    found: list[_SeenSymbols] = []
+    for frame, (_number, readings) in enumerate(frames):
+        still = [seen for seen in found if 0 < frame - seen.places[-1][0] <= MAX_UNSEEN]
+        for place, reading in enumerate(readings):
+            if reading.symbols is None:
+                continue
+            odds = [(_same_log_odds(seen, reading), k) for k, seen in enumerate(still)]
+            best = max(odds, default=(-math.inf, -1))
+            if best[0] >= MIN_SAME_LOG_ODDS:
+                seen = still.pop(best[1])
+                seen.places.append((frame, place))
+                seen.readings.append(reading)
+            else:
+                found.append(_SeenSymbols([(frame, place)], [reading]))
+    return found
+
+
+def _same_log_odds(seen: _SeenSymbols, reading: PlateReading) -> float:
+    """Log odds that a reading shows the symbols of a plate, against unrelated ones."""
+    assert reading.symbols is not None
+    scores = seen.scores
+    if scores.shape != reading.symbols.scores.shape:
+        return -math.inf
+    codes = seen.code, reading.code
+    if codes[0] is not None and codes[1] is not None and codes[0].digits != codes[1].digits:
+        return -math.inf
+    return float(np.logaddexp.reduce(scores + reading.symbols.scores - math.log(16), axis=1).sum())
+
+
+def _normalized(scores: Array) -> Array:
+    """Scores whose exponentials are 16 times probabilities."""
+    normalized: Array = scores - np.logaddexp.reduce(scores, axis=1, keepdims=True) + math.log(16)
+    return normalized
+
+
+def _joint_code(seen: _SeenSymbols) -> tuple[PlateCode, float] | None:
+    """The code that a plate's frames show together, and its probability; None where they leave it open."""
+    alone = [one for one in seen.readings if one.code is not None]
+    if alone:
+        code = alone[0].code
+        assert code is not None
+        return code, min(one.confidence for one in alone)
+    scores, look_alikes = seen.scores, min(one.symbols.look_alikes for one in seen.readings if one.symbols is not None)
+    n = next((n for n in SIZES if len(code_cells(n)) == len(scores)), None)
+    word = None if n is None else decode_word(np.exp(scores) / 16, n)
+    if word is None or word.confidence(look_alikes) < 1 - MAX_CHECKED_ERROR:
+        return None
+    return word.code, word.confidence(look_alikes)

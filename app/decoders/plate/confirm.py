@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from app.decoders.plate import Array
 from app.markers.plate import PlateCode
 from app.markers.reading import Certainty, PlateOutcome, PlateReading
+from app.sensors.camera import Camera
 
 # === How well pixels agree with a pattern of units, in one frame or in several.
 #
@@ -209,3 +211,90 @@ def _read(reading: PlateReading, error_probability: float, frames: tuple[int, ..
         reading, outcome=PlateOutcome.READ, code=reading.likely_code, likely_code=None, doubtful_cells=(),
         confidence=1 - error_probability, reason="", frames=frames,
     ))  # fmt: skip
+
+
+# === Frames that should show a plate which frames beside them show.
+
+
+MAX_EXPECTED = 6
+"""[frames] before and after those that show a plate, in which it is expected."""
+FRAME_ADVANCES_M, ADVANCE_HYPOTHESES = (0.1, 4.0), 24
+"""[m] that a vehicle comes on between two frames, where no two of them show how much, and hypotheses in between. 10 m/s
+at 100 Hz to 40 m/s at 10 Hz."""
+ADVANCE_ERRORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3)
+"""[1] ratios that are tried to the advance that other frames show."""
+STANDING_M = 0.05
+"""[m] advance from frame to frame below which a vehicle stands: another frame shows the same again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveFrame:
+    """What a frame of a drive shows, in the order in which the frames were taken."""
+
+    number: int
+    readings: Sequence[PlateReading]
+    camera: Camera | None
+
+
+class Expected(NamedTuple):
+    """A plate that another frame shows."""
+
+    number: int  # of that frame
+    reading: PlateReading  # as it shows it
+    advances_m: tuple[float, ...]  # how far the vehicle may have come since
+
+
+def list_expected(frames: Sequence[DriveFrame]) -> dict[int, list[Expected]]:
+    """Plates that frames should show, because frames beside them do; by the number of the frame.
+
+    The advance follows from two frames that show the plate; where only one does, it is open.
+    """
+    expected: dict[int, list[Expected]] = {}
+    for seen in _list_seen(frames):
+        places = np.array([place for place, _ahead_m, _reading in seen])
+        for place in range(max(places[0] - MAX_EXPECTED, 0), min(places[-1] + MAX_EXPECTED + 1, len(frames))):
+            if place in places:
+                continue
+            nearest = int(np.abs(places - place).argmin())
+            advances_m = _advances_m(seen, place - int(places[nearest]))
+            if advances_m:
+                plate = Expected(frames[places[nearest]].number, seen[nearest][2], advances_m)
+                expected.setdefault(frames[place].number, []).append(plate)
+    return expected
+
+
+def with_expected(readings: Sequence[PlateReading], found: Sequence[PlateReading]) -> list[PlateReading]:
+    """Readings of a frame with the plates that were found where they are expected, in place of refused ones there."""
+    sure = [one for one in readings if one.code is not None]
+    new = [one for one in found if not any(one.is_at(other) for other in sure)]
+    refused = [one for one in readings if one.code is None and not any(one.is_at(other) for other in new)]
+    return [*sure, *new, *refused]
+
+
+_SeenAhead = list[tuple[int, float, PlateReading]]
+
+
+def _list_seen(frames: Sequence[DriveFrame]) -> list[_SeenAhead]:
+    """Sure readings of each plate with its distance ahead [m], in frames in a row."""
+    found: list[_SeenAhead] = []
+    latest: dict[PlateCode, _SeenAhead] = {}
+    for place, frame in enumerate(frames):
+        for reading in frame.readings:
+            if reading.code is None or reading.pose is None or frame.camera is None:
+                continue
+            ahead_m = float(frame.camera.camera_from_vehicle[:, 0] @ reading.pose.translation_m)
+            known = latest.get(reading.code)
+            if known is None or place - known[-1][0] > 2 * MAX_EXPECTED:
+                known = latest[reading.code] = []
+                found.append(known)
+            known.append((place, ahead_m, reading))
+    return found
+
+
+def _advances_m(seen: _SeenAhead, frames: int) -> tuple[float, ...]:
+    """How far the vehicle may have come in so many frames since the plate was seen; none where it stands. [m]"""
+    first, last = seen[0], seen[-1]
+    if last[0] > first[0]:
+        step_m = (first[1] - last[1]) / (last[0] - first[0])
+        return tuple(ratio * step_m * frames for ratio in ADVANCE_ERRORS) if abs(step_m) > STANDING_M else ()
+    return tuple(float(frames * step_m) for step_m in np.geomspace(*FRAME_ADVANCES_M, ADVANCE_HYPOTHESES))

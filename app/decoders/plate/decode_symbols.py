@@ -222,11 +222,6 @@ REGISTERED_CONFIDENCE = 0.9999
 MAX_CODEBOOK_CHANGES, RIVAL_CELLS = 3, 3
 """[cells] by which a registered position plate may differ from what was read, and by how many more every other one
 must. Plates within 500 m share most of their digits."""
-RISK_RESIDUALS = (0.025, 0.075, 0.125, 0.175, 0.215, 0.265, 0.35, 0.45)
-CELL_RISKS = (0.002, 0.013, 0.038, 0.07, 0.16, 0.17, 0.3, 0.4)
-"""[contrast, probability] `UnitEvidence.level_residual` of a cell, and how often such a cell shows another symbol than
-was built. Source: plates with Reed-Solomon checks in shade, glare, dirt and wear, 1560 frames of the seeds 601 and 602
-of `python -m benchmarks.plates schemes`."""
 RANDOM_PRIOR, UNCLEAN_RANDOM_PRIOR = 0.01, 1.0
 """[1] odds that a plate's symbols are random against that they are a codeword of a given scheme: on a plate whose image
 looks clean, and on others. No wrong reading in the same frames up to a confidence of 0.98."""
@@ -272,6 +267,7 @@ def decode_symbols(
     min_confidence: float,
     *,
     clean: bool = True,
+    look_alikes: float = 1.0,
     max_damage: float = MAX_DAMAGE,
 ) -> DecodedSymbols:
     """Most likely code: read as it is, corrected, or taken from the codebook, in this order.
@@ -286,10 +282,12 @@ def decode_symbols(
         Probability from which digits are returned.
     clean : bool
         The image looks so much like a plate that wrong cells may be corrected without a registry.
+    look_alikes : float
+        Share of the look-alikes that show as much of a plate's markers.
     max_damage : float
         Of digits that neither Reed-Solomon checks nor the registry confirm.
     """
-    read = _decode_alone(evidence, n, min_confidence, clean=clean)
+    read = _decode_alone(evidence, n, min_confidence, clean, look_alikes)
     known = [code for code in codebook if code.n == n]
     if not known:
         return _refuse_damaged(read, evidence, max_damage)
@@ -298,7 +296,8 @@ def decode_symbols(
         return replace(read, code=same, confirmed=True)
     if read.checked:
         return read
-    chosen = _decode_with_codebook(evidence, known, min_confidence) or _correct_to_registered(evidence, known)
+    chance = CHANCE_LOG_ODDS + math.log(look_alikes)
+    chosen = _decode_with_codebook(evidence, known, min_confidence) or _correct_to_registered(evidence, known, chance)
     if chosen is not None:
         return chosen
     if read.corrected:
@@ -319,22 +318,24 @@ def _refuse_damaged(read: DecodedSymbols, evidence: UnitEvidence, max_damage: fl
     return replace(read, code=None, likely=read.code, reason=reason)
 
 
-def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:
+def _correct_to_registered(
+    evidence: UnitEvidence, known: list[PlateCode], chance_log_odds: float
+) -> DecodedSymbols | None:
     """The registered plate that differs from what was read only where the plate is damaged.
 
     A plate with Reed-Solomon checks differs from others in many cells, so its symbols need only be likelier than random
-    ones, by `CHANCE_LOG_ODDS` and the number of registered plates. A plain position plate's neighbours share most of
+    ones, by `chance_log_odds` and the number of registered plates. A plain position plate's neighbours share most of
     its digits: it may differ in three cells, each of which is uncertain or shows what no digit looks like, and no other
     registered plate may be nearly as near.
     """
     cells = _softmax_confidence(evidence.cell_costs, evidence.best.tolist())
     damaged = (cells < UNCERTAIN_CELL) | _outliers(evidence) | (evidence.best > 9)
-    scores = np.log(16 * _symbol_probabilities(evidence))
+    scores = np.log(16 * symbol_probabilities(evidence))
     changes = np.array([np.asarray(code.symbols) != evidence.best for code in known])
     for code, changed in zip(known, changes, strict=True):
         if code.scheme.corrects:
             score = float(scores[np.arange(len(scores)), code.symbols].sum())
-            near = score - math.log(len(known)) >= CHANCE_LOG_ODDS
+            near = score - math.log(len(known)) >= chance_log_odds
         else:
             rivals = int((changes.sum(axis=1) < changed.sum() + RIVAL_CELLS).sum()) - 1
             near = changed.sum() <= MAX_CODEBOOK_CHANGES and not (changed & ~damaged).any() and rivals == 0
@@ -353,9 +354,11 @@ def _softmax_confidence(costs: Array, chosen: Sequence[int]) -> Array:
     return share
 
 
-def _decode_alone(evidence: UnitEvidence, n: int, min_confidence: float, *, clean: bool) -> DecodedSymbols:
+def _decode_alone(
+    evidence: UnitEvidence, n: int, min_confidence: float, clean: bool, look_alikes: float
+) -> DecodedSymbols:
     costs = evidence.cell_costs
-    checked = _decode_checked(evidence, n, clean=clean)
+    checked = _decode_checked(evidence, n, clean, look_alikes)
     if checked.code is not None and checked.confidence >= min_confidence:
         return checked
     factor = np.where(_outliers(evidence), OUTLIER_CONFIDENCE, 1.0)
@@ -385,41 +388,63 @@ def _outliers(evidence: UnitEvidence) -> npt.NDArray[np.bool_]:
     return found
 
 
-def _symbol_probabilities(evidence: UnitEvidence) -> Array:
+def symbol_probabilities(evidence: UnitEvidence) -> Array:
     """Probability of each symbol of each cell, shape (cells, 16): by its units, unless damage hides what was built."""
     likelihood = np.exp(-0.5 * TEMPER * evidence.cell_costs)
-    risk = np.interp(evidence.level_residual, RISK_RESIDUALS, CELL_RISKS)[:, None]
+    risk = 1 / (1 + np.exp(-evidence.risk_log_odds[:, None]))
     probabilities: Array = (1 - risk) * likelihood / likelihood.sum(axis=1, keepdims=True) + risk / 16
     return probabilities
 
 
-def _decode_checked(evidence: UnitEvidence, n: int, *, clean: bool) -> DecodedSymbols:
-    """The likeliest codeword of a scheme with Reed-Solomon checks, and its probability.
+def _decode_checked(evidence: UnitEvidence, n: int, clean: bool, look_alikes: float) -> DecodedSymbols:
+    """The likeliest codeword of a scheme with Reed-Solomon checks, and its probability."""
+    found = decode_word(symbol_probabilities(evidence), n)
+    if found is None:
+        return DecodedSymbols(None, 0.0, ())
+    confidence = found.confidence(RANDOM_PRIOR if clean else UNCLEAN_RANDOM_PRIOR * look_alikes)
+    is_checked = found.confidence(look_alikes) > 1 - MAX_CHECKED_ERROR
+    symbols = found.code.symbols
+    changed = tuple(i for i, (a, b) in enumerate(zip(evidence.best, symbols, strict=True)) if a != b)
+    cells = _softmax_confidence(evidence.cell_costs, symbols)
+    cells[list(changed)] = confidence
+    return DecodedSymbols(found.code, confidence, _floats(cells), changed, checked=is_checked)
 
-    The error probability is that of another codeword of the scheme, of another scheme, or of random symbols, such as
-    those of a plate that is stained all over. Random symbols get a confidence of c with a probability of (1 - c) / c /
-    `RANDOM_PRIOR` at most (`LikelyCodeword.log_evidence`): 1/20 at `MIN_CONFIDENCE`.
+
+class CheckedWord(NamedTuple):
+    """The likeliest codeword of all schemes with Reed-Solomon checks."""
+
+    code: PlateCode
+    wrong: float  # [probability] that another codeword of its scheme is on the plate
+    log_evidence: float  # as of `LikelyCodeword`
+    log_rivals: float  # the same of the other schemes together
+
+    def confidence(self, random_prior: float) -> float:
+        """Probability of the code, where random symbols have these odds against a codeword of a scheme.
+
+        Such are those of a plate that is stained all over. They get a confidence of c with a probability of (1 - c) /
+        c / `random_prior` at most (`LikelyCodeword.log_evidence`): 1/20 at `MIN_CONFIDENCE` and `RANDOM_PRIOR`.
+        """
+        rival = float(np.logaddexp(self.log_rivals, math.log(random_prior)))
+        return (1 - self.wrong) / (1 + math.exp(min(rival - self.log_evidence, 700.0)))
+
+
+def decode_word(probabilities: Array, n: int) -> CheckedWord | None:
+    """The likeliest codeword of a scheme with Reed-Solomon checks; None where no scheme has any.
+
+    Parameters
+    ----------
+    probabilities : ndarray, shape (cells, 16)
+        Of the symbols of each cell.
     """
-    probabilities = _symbol_probabilities(evidence)
     found = [(scheme, likely_codeword(probabilities, n, scheme)) for scheme in PlateScheme if scheme.corrects]
     rivals: list[tuple[PlateScheme, LikelyCodeword]] = [(s, word) for s, word in found if word is not None]
     if not rivals:
-        return DecodedSymbols(None, 0.0, ())
+        return None
     scheme, best = max(rivals, key=lambda rival: rival[1].log_evidence)
     others = [word.log_evidence for _, word in rivals if word is not best]
     others.append(_decimal_evidence(probabilities, n))
-
-    def confidence_given(random_prior: float) -> float:
-        rival = float(np.logaddexp.reduce([*others, math.log(random_prior)]))
-        return (1 - best.wrong) / (1 + math.exp(min(rival - best.log_evidence, 700.0)))
-
-    confidence = confidence_given(RANDOM_PRIOR if clean else UNCLEAN_RANDOM_PRIOR)
-    is_checked = confidence_given(1.0) > 1 - MAX_CHECKED_ERROR
-    changed = tuple(i for i, (a, b) in enumerate(zip(evidence.best, best.symbols, strict=True)) if a != b)
-    cells = _softmax_confidence(evidence.cell_costs, best.symbols)
-    cells[list(changed)] = confidence
     code = PlateCode.from_symbols(best.symbols, scheme, n)
-    return DecodedSymbols(code, confidence, _floats(cells), changed, checked=is_checked)
+    return CheckedWord(code, best.wrong, best.log_evidence, float(np.logaddexp.reduce(others)))
 
 
 def _decimal_evidence(probabilities: Array, n: int) -> float:

@@ -90,14 +90,15 @@ def difference_signal(planes: Planes) -> MarkerSignal:
 def ratio_signal(planes: Planes) -> MarkerSignal:
     """The ratio of red to green relative to the neighbourhood: weak colours in haze, glare or a colour cast.
 
-    About 128 times the ratio's logarithm, less in the dark.
+    About 128 times the ratio's logarithm, less in the dark. The neighbourhood lies above and below: what a wet road
+    mirrors is an upright streak in the image.
     """
     opponent: Array = np.empty(planes.red.shape, np.int16)
     _ratio(planes.green.reshape(-1), planes.red.reshape(-1), opponent.reshape(-1))
     height, width = opponent.shape
     means = np.empty((max(height // BLOCK, 1), max(width // BLOCK, 1)), np.int16)
     _block_means(opponent, means)  # cv2.resize by area takes ten times as long where the sides are no multiples
-    level = cv2.medianBlur(means, 5)
+    level = _median_along_columns(means)
     opponent = cv2.subtract(opponent, cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR))
     return _signal(opponent, planes, RATIO_LEVELS)
 
@@ -171,6 +172,15 @@ def _ratio(green: Grey, red: Grey, opponent: Signal) -> None:
         r = np.float32(red[k])
         g = np.float32(green[k])
         opponent[k] = np.int16(np.int32(np.float32(256.0) * (r - g) / (r + g + np.float32(24.0))))
+
+
+def _median_along_columns(means: Signal) -> Signal:
+    """Median of each block and the two above and below, by comparing whole rows, which is faster than sorting."""
+    padded = np.pad(means, ((2, 2), (0, 0)), mode="edge")
+    a, b, c, d, e = (padded[k : k + len(means)] for k in range(5))
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    return np.asarray(np.maximum(np.minimum(low, high), np.minimum(e, np.maximum(low, high))), np.int16)
 
 
 @ieee_kernel

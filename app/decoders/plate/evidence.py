@@ -10,11 +10,11 @@ import numpy as np
 
 from app.decoders.plate import Array
 from app.decoders.plate.confirm import UnitVerification, with_unseen_damage
-from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
-from app.decoders.plate.marker_colours import MarkerColours
+from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols, symbol_probabilities
+from app.decoders.plate.marker_colours import MarkerColours, count_clear
 from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.markers.plate import PlateCode, PlateGeometry
-from app.markers.reading import PlateOutcome, PlateReading
+from app.markers.reading import PlateOutcome, PlateReading, SymbolEvidence
 
 MIN_CONFIDENCE = 0.9995
 """[probability] from which digits are returned. Source: no wrong digits (decision record 0010, rule 5)."""
@@ -29,6 +29,9 @@ of `python -m benchmarks.plates trials` of 10 to 12 rows: below it the units are
 CLEAN_EXPLAINED = 0.93
 """[1] share of variance from which a word may be corrected without a registry. Effect: `python -m
 benchmarks.plates.thresholds`."""
+CLEAR_MARKERS, CLEAR_LOOK_ALIKES = 3, 0.1
+"""[markers, 1] clear markers from which on one may be hidden, and share of the look-alikes that have as many. Effect:
+`python -m benchmarks.plates false --sets look-alikes`."""
 MAX_ERROR = 1e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
 stains and in fair light (decision record 0011)."""
@@ -100,10 +103,11 @@ def read_evidence(
         Compares the pixels with a code that the registry does not confirm, where something on the plate is unusual;
         where it cannot, the units decide.
     """
-    thermal = evidence.thermal
+    thermal, look_alikes = evidence.thermal, _look_alikes(evidence)
     decoded = decode_symbols(
         evidence.units, evidence.geometry.n, codebook, MIN_CONFIDENCE,
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
+        look_alikes=look_alikes,
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
     )  # fmt: skip
     lacking = _find_lacking(evidence)
@@ -121,6 +125,7 @@ def read_evidence(
         corrected_cells=decoded.corrected,
         from_codebook=decoded.from_codebook or (decoded.confirmed and not decoded.checked and is_unsure_alone),
         unit_log_likelihoods=found.log_likelihoods if found is not None else None,
+        symbols=None if thermal else SymbolEvidence(np.log(16 * symbol_probabilities(evidence.units)), look_alikes),
     )
     if decoded.code is not None and (settled or refusal is None):
         read = replace(
@@ -154,6 +159,12 @@ def _find_lacking(evidence: PlateEvidence) -> tuple[PlateOutcome, str] | None:
     if evidence.explained < (MIN_EXPLAINED_SMALL if evidence.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE):
         return PlateOutcome.UNSURE, "the plate's pattern explains too little of the image"
     return None
+
+
+def _look_alikes(evidence: PlateEvidence) -> float:
+    """Share of the look-alikes that show as much of a plate's grid and markers."""
+    has_markers = evidence.colours is not None and count_clear(evidence.colours) >= CLEAR_MARKERS
+    return CLEAR_LOOK_ALIKES if has_markers and evidence.explained >= MIN_EXPLAINED_ALONE else 1.0
 
 
 def _is_small(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:

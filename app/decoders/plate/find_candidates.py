@@ -49,8 +49,11 @@ and of the road's spread over that of the units; share of their variance that tw
 square of the logarithm by which the markers are too small or large; whether all green squares were seen."""
 (BEST_MARGIN, WEAKEST_TINT, SECOND_TINT, BEST_TINT, BLUE_CAST, RED_CAST, RANK, CONTRAST, UNIFORMITY, TWO_LEVELS, ROAD,
  SIZE, SIZE2, SIDE_RATIO, ALL_SQUARES) = range(3, len(FEATURES))  # fmt: skip
+WEAKEST_MARGIN = 0
 MAX_RANK, USUAL_SIZE = 12.0, 3.5
 """[log odds, log10 px^2] rank above which none counts more, and size about which the squares are taken."""
+HIDDEN_LOG_ODDS = -5.0
+"""[log odds] that a marker of a plate is hidden."""
 MIN_LOG_ODDS = -5.0
 """[log odds] below which a candidate is not fitted. Source: decision record 0010."""
 WEIGHTS = np.array(
@@ -121,11 +124,16 @@ def candidate_features(signal: MarkerSignal, quads: Sequence[MarkerQuad], geomet
 def candidate_log_odds(signal: MarkerSignal, quads: Sequence[MarkerQuad], geometry: PlateGeometry) -> Floats:
     """Logarithms of the odds that candidates are plates of a geometry whose fit succeeds, shape (Q,).
 
-    Parameters as of `candidate_features`. Source: logistic regression, fitted like `WEIGHTS`.
+    Parameters as of `candidate_features`. A mixture: all markers are seen, or snow, sand or a mirrored light hides the
+    weakest one, which then counts as much as the second. Source: logistic regression, fitted like `WEIGHTS`.
     """
     features = candidate_features(signal, quads, geometry)
-    log_odds = features @ WEIGHTS[:-1] + WEIGHTS[-1]
-    return np.where(np.isfinite(log_odds), log_odds, -np.inf)
+    seen = features @ WEIGHTS[:-1] + WEIGHTS[-1]
+    features[:, WEAKEST_MARGIN] = features[:, WEAKEST_MARGIN + 1]
+    features[:, WEAKEST_TINT] = features[:, SECOND_TINT]
+    hidden = features @ WEIGHTS[:-1] + WEIGHTS[-1] + HIDDEN_LOG_ODDS
+    seen, hidden = (np.where(np.isfinite(log_odds), log_odds, -np.inf) for log_odds in (seen, hidden))
+    return np.logaddexp(seen, hidden)
 
 
 def size_misfit(quad: MarkerQuad, geometry: PlateGeometry) -> float:

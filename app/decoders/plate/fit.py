@@ -132,7 +132,7 @@ def corner_jacobian(pose: PlaneArray, frame: PlaneArray, corners_px: PlaneArray)
 BLUR_PRIOR = (math.log(0.7), 0.35)
 """[log px] mean and standard deviation of the lens blur's logarithm. The simulated cameras have 0.4 to 1.2 px
 (`simulation.conditions`)."""
-MOTION_PRIOR = (0.001, 0.0045)
+MOTION_PRIOR = (0.001, 0.02)
 """[plate sides^2] mean and standard deviation of the square of the motion's length. 50 km/h at 1/500 s are 0.028 m,
 0.007 plate sides squared."""
 MIN_COARSE_EXPLAINED = (0.3, 0.74, 0.8, 0.83, 0.85, 0.85)
@@ -156,7 +156,7 @@ FLAT_NOISE = 0.02
 """[variance of the plate's light] noise that the first step assumes, before there is a residual."""
 MAX_BLUR_STEP = 0.4
 """[log px] by which a step may change the lens blur."""
-MAX_MOTION2_STEP = 0.01
+MAX_MOTION2_STEP = 0.03
 """[plate sides^2] by which a step may lengthen the motion's square."""
 PATCH_MARGIN = 0.03
 """[plate sides] around the plate from which pixels are used, and two pixels more."""

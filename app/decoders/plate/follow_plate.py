@@ -6,16 +6,22 @@ compared with the frame, and the plate is fitted where the two agree best.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
 from app.decoders.plate import Array
-from app.decoders.plate.evidence import PlateEvidence
+from app.decoders.plate.confirm import Expected
+from app.decoders.plate.detect_blobs import difference_signal, half_planes
+from app.decoders.plate.evidence import PlateEvidence, read_evidence
 from app.decoders.plate.fit import fit_plate, project
-from app.decoders.plate.pose import marker_centroids
-from app.decoders.plate.unit_likelihoods import unit_log_likelihoods
-from app.markers.plate import PlateGeometry
-from app.markers.reading import PlatePose
+from app.decoders.plate.marker_colours import measure_marker_colours
+from app.decoders.plate.pose import marker_centroids, unit_edges, with_pose
+from app.decoders.plate.unit_likelihoods import unit_log_likelihoods, with_hidden_markers
+from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.reading import PlateOutcome, PlatePose, PlateReading
 from app.sensors.camera import Camera
 
 REACH_PX = 14
@@ -28,6 +34,12 @@ MIN_UNIT_PX = 2.0
 units differ from the plate's there, in compressed videos."""
 MIN_EXPLAINED = 0.85
 """[1] share of the variance from which a view that was found so counts."""
+MIN_EXPECTED_UNIT_PX = 1.2
+"""[px] height of a unit in the image from which on a plate is expected to be seen."""
+MIN_EXPECTED_LIKENESS = 0.35
+"""[1] normalised correlation with a plate's pattern from which on it is fitted. For speed: its units decide."""
+PATTERN_UNIT_PX, DARK_GREY, LIGHT_GREY, GAP_GREY, MARKER_GREY = 6, 60, 200, 110, 120
+"""[px, grey levels] resolution of a pattern, and its greys: a dark and a light unit, gaps, and markers."""
 SMOOTHING = 0.4
 """[px] blur of the warped image, for each pixel of the smaller one."""
 _UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
@@ -91,6 +103,102 @@ def view_elsewhere(known: PlateEvidence, image: Array, other: Array, corners_px:
         units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px, extent_px,
         thermal=known.thermal,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedPlate:
+    """A plate that another frame of a drive shows, and where it may be in this one."""
+
+    code: PlateCode
+    geometry: PlateGeometry
+    # shape (K, 4, 2): [px] its corners under each hypothesis of how far the vehicle has come
+    places_px: Array
+    number: int  # of the other frame
+
+
+def expect_plate(expected: Expected, camera: Camera) -> ExpectedPlate | None:
+    """Where a plate that was read in one frame may be in another; None where it is out of view there."""
+    reading = expected.reading
+    code, geometry, pose = reading.code, reading.geometry, reading.pose
+    if code is None or geometry is None or pose is None:
+        return None
+    placed = [predict_corners(pose, geometry, camera, advance_m) for advance_m in expected.advances_m]
+    high = (camera.width_px - 1, camera.height_px - 1)
+    seen = [one for one in placed if one is not None and (one >= 0).all() and (one <= high).all()]
+    seen = [one for one in seen if np.ptp(one[:, 1]) >= MIN_EXPECTED_UNIT_PX * geometry.n]
+    return ExpectedPlate(code, geometry, np.array(seen), expected.number) if seen else None
+
+
+def find_expected(image: Array, expected: ExpectedPlate, camera: Camera | None = None) -> PlateReading | None:
+    """The reading of a plate that is expected in a frame, by its pattern; None where it is not seen.
+
+    Its pattern is projected to each place and compared with the frame around it. Where they are most alike the plate is
+    fitted, and its units must show the code as those of a registered plate must (`decode_symbols`). No colours are
+    needed, so that markers may be covered, mirrored over or too weak to be found.
+    """
+    code, geometry = expected.code, expected.geometry
+    grey, pattern = _grey(image), _grey_pattern(code, geometry)
+    ends = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32) * len(pattern)
+    matches = [(*_best_match(grey, pattern, ends, place), place) for place in expected.places_px]
+    likeness, shift, place = max(matches, key=lambda match: match[0])
+    if likeness < MIN_EXPECTED_LIKENESS:
+        return None
+    image_from_plate = cv2.getPerspectiveTransform(_UNIT_SQUARE, (place + shift).astype(np.float32))
+    fit = fit_plate(image, project(np.asarray(image_from_plate, float), marker_centroids(geometry)), geometry)
+    units = None if fit is None else unit_log_likelihoods(fit)
+    if fit is None or units is None:
+        return None
+    colours = measure_marker_colours(difference_signal(half_planes(image)), fit.plate_from_image, geometry)
+    units = with_hidden_markers(units, colours.tints, geometry.n)
+    extent_px = np.ptp(fit.corners_px, axis=0)
+    evidence = PlateEvidence(
+        units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px, float(extent_px.min()),
+        weakest_marker=float(colours.margins.min()), colours=colours,
+        missing=(PlateOutcome.UNSURE, "found by the plate that another frame shows"),
+    )  # fmt: skip
+    reading = PlateReading(
+        PlateOutcome.UNSURE, fit.corners_px, fit.corners_covariance_px2, geometry=geometry,
+        width_px=float(extent_px[0]), height_px=float(extent_px[1]),
+    )  # fmt: skip
+    reading, _decoded = read_evidence(reading, evidence, (code,))
+    if reading.code is None or reading.code.digits != code.digits:
+        return None
+    return with_pose(replace(reading, from_codebook=False, frames=(expected.number,)), camera)
+
+
+@lru_cache(maxsize=16)
+def _grey_pattern(code: PlateCode, geometry: PlateGeometry) -> Array:
+    """Grey levels of a plate's face in even light, uint8, square."""
+    size = PATTERN_UNIT_PX * geometry.n
+    at = (np.arange(size) + 0.5) / size
+    edges = unit_edges(geometry)
+    place = np.clip(np.searchsorted(edges[:, 1], at), 0, geometry.n - 1)
+    is_unit = at >= edges[place, 0]
+    grey = np.where(code.units[np.ix_(place, place)] > 0, DARK_GREY, LIGHT_GREY)
+    corner = (place < 2) | (place >= geometry.n - 2)
+    is_corner = corner[:, None] & corner[None]
+    grey = np.where(is_unit[:, None] & is_unit[None] | is_corner, grey, GAP_GREY)
+    return np.where(is_corner, MARKER_GREY, grey).astype(np.uint8)
+
+
+def _best_match(grey: Array, pattern: Array, ends: Array, to_px: Array) -> tuple[float, Array]:
+    """Highest normalised correlation of a pattern around a place, and by how far it is shifted there. [px]"""
+    low = np.floor(to_px.min(axis=0)).astype(int) - 1
+    size = np.ceil(to_px.max(axis=0)).astype(int) + 2 - low
+    first = np.maximum(low - REACH_PX, 0)
+    last = np.minimum(low + size + REACH_PX, [grey.shape[1], grey.shape[0]])
+    if (last - first < size).any():
+        return -1.0, np.zeros(2)
+    scale = len(pattern) / max(cv2.contourArea(to_px.astype(np.float32)), 1.0) ** 0.5
+    smooth = cv2.GaussianBlur(pattern, (0, 0), max(SMOOTHING * scale, 0.5))
+    warp = cv2.getPerspectiveTransform(ends, (to_px - low).astype(np.float32))
+    shape = (int(size[0]), int(size[1]))
+    template = cv2.warpPerspective(smooth, warp, shape)
+    mask = cv2.warpPerspective(np.full_like(pattern, 255), warp, shape, flags=cv2.INTER_NEAREST)
+    scores = cv2.matchTemplate(grey[first[1] : last[1], first[0] : last[0]], template, cv2.TM_CCOEFF_NORMED, mask=mask)
+    scores[~np.isfinite(scores)] = -1.0
+    _least, best, _where, at = cv2.minMaxLoc(scores)
+    return float(best), np.array(at) + first - low
 
 
 def _best_shift(image: Array, from_px: Array, other: Array, to_px: Array) -> Array | None:

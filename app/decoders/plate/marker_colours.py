@@ -61,7 +61,7 @@ class PromisingColours:
     weakest_tint: float = 0.3
     # share of the variance that is explained [1], or margin of the second weakest marker [standard deviations], with
     # which the weakest may be missing
-    clear_explained: float = 0.93
+    clear_explained: float = 0.85
     clear_margin: float = 8.0
     cast: tuple[float, float] = (0.74, 1.35)  # blue and red of the units over their green
 
@@ -120,10 +120,22 @@ def is_promising(colours: MarkerColours, explained: float) -> bool:
     )
 
 
+def count_clear(colours: MarkerColours) -> int:
+    """Markers whose colours need no registry to confirm them."""
+    pale = _is_pale(colours)
+    return 4 - int(pale.sum())
+
+
+def _is_pale(colours: MarkerColours) -> npt.NDArray[np.bool_]:
+    min_tints = np.array([ALONE.min_triangle_tint, *(3 * [ALONE.min_tint])])
+    pale: npt.NDArray[np.bool_] = (colours.margins < ALONE.min_margin) | (colours.tints < min_tints)
+    return pale
+
+
 def find_wrong_colour(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
     """A marker or units whose colours need a registry to confirm them: a look-alike or a worn plate."""
-    pale = (colours.margins < ALONE.min_margin) | (colours.tints < ALONE.min_tint)
-    if pale[0] or colours.tints[0] < ALONE.min_triangle_tint:
+    pale = _is_pale(colours)
+    if pale[0]:
         return PlateOutcome.RED_MARKER_MISSING, "the red triangle is hardly red"
     if colours.beside > ALONE.max_beside:
         return PlateOutcome.RED_MARKER_MISSING, "the red spreads from beside the plate"

@@ -33,7 +33,13 @@ from app.decoders.plate.marker_colours import (
     with_red_around,
 )
 from app.decoders.plate.pose import marker_centroids, with_pose
-from app.decoders.plate.unit_likelihoods import UnitEvidence, code_units, unit_log_likelihoods, verify_units
+from app.decoders.plate.unit_likelihoods import (
+    UnitEvidence,
+    code_units,
+    unit_log_likelihoods,
+    verify_units,
+    with_hidden_markers,
+)
 from app.errors import InvalidParameter
 from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode, PlateGeometry, plate_capacity
 from app.markers.reading import PlateGrade, PlateOutcome, PlateReading
@@ -60,7 +66,7 @@ class FitLimits:
     # [log odds] of a candidate that gets a second geometry where the first explains nothing
     min_second_log_odds: float = -3.0
     # [1] by which a coarse fit may explain less than the best fit under another geometry, and still be finished
-    coarse_loss: float = 0.04
+    coarse_loss: float = 0.08
     same_marker: float = 0.03  # [plate] distance of two candidates' markers up to which one fit serves both
     # [plate, px] distance of the fitted markers from the detected ones, the sum of both
     max_centroid_shift: tuple[float, float] = (0.15, 1.5)
@@ -297,6 +303,8 @@ class FrameReader:
             outcome, reason = missing or (reading.outcome, "the units do not stand out of the noise")
             return PlateInFrame(replace(reading, outcome=outcome, reason=reason), None)
         is_thermal = self._image.ndim == 2
+        if colours is not None:
+            units = with_hidden_markers(units, colours.tints, plate.geometry.n)
         evidence = PlateEvidence(
             units=units,
             geometry=plate.geometry,

@@ -110,6 +110,14 @@ STAIN_DARK, STAIN_LIGHT = 0.07, 0.105
 """[contrast] residual of a dark or light unit's pixels from which on it may be a stain."""
 MIN_OF_A_LEVEL = 6
 """[units] light or dark ones from which on their median is the usual residual."""
+RISK_CONSTANT, RISK_OF_LEVEL, RISK_OF_MISFIT, RISK_BESIDE_HIDDEN = -0.765, 1.98, 1.877, 2.289
+"""[log odds] that a cell shows another symbol than was built: alone, for the logarithms of its level residual and of
+its pixels' misfit, and beside a marker that is hidden. Source: logistic regression over 9,570 cells of `id` and
+`position-robust` plates in weather, shade, glare, stains and wear (decision record 0008)."""
+RISK_FLOOR = 0.05
+"""[contrast] added to a level residual before its logarithm."""
+HIDDEN_TINT, HIDDEN_TINT_SPREAD = 0.3, 0.08
+"""[1] tint of a marker that is hidden or not with even odds, and the scale of the logistic function around it."""
 TAIL_SHARE = 1 / 8
 """[1] share of the units whose mean is the lightest and the darkest level."""
 MIN_LEVEL_DIFFERENCE, ONE_LEVEL_DIFFERENCE = 0.1, 0.8
@@ -141,6 +149,7 @@ class UnitEvidence:
     span: float  # light of the light units above the dark ones. [linear, 1 = saturation]
     # light that the plate does not send: what was taken off, and the other explanation if it is not much less likely
     veils: tuple[Veil, ...]
+    risk_log_odds: Array  # shape (cells,): that something hides what was built in a cell
     veil_log_odds: float = math.inf  # of the first against the other
 
     @property
@@ -240,6 +249,7 @@ def _under_veil(fit: PlateFit, levels: LightLevels, veil: Veil) -> UnitEvidence 
     misfit = np.sqrt(fit.unit_misfit.reshape(-1)[unit_index(n).reshape(-1)])
     outlier_ratio = _worst_misfit(misfit, levels.values, dark) * min(1.0, fit.unit_px / STAIN_UNIT_PX)
     damage = float(level_residual.max()) * outlier_ratio
+    worst = (misfit / max(_median(misfit), 1e-9)).reshape(-1, 4).max(axis=1)
     level_residual *= max(1.0, _blur_units(fit) * MAX_LEVEL_RESIDUAL / MAX_RESIDUAL_SPREAD)
     return UnitEvidence(
         cell_costs=costs - costs.min(axis=1, keepdims=True),
@@ -256,7 +266,48 @@ def _under_veil(fit: PlateFit, levels: LightLevels, veil: Veil) -> UnitEvidence 
         gap=(fit.gap - float(veil.light.mean())) / veil.level,
         span=levels.light - levels.dark,
         veils=(veil,),
+        risk_log_odds=_risk_log_odds(level_residual, worst),
     )
+
+
+def _risk_log_odds(level_residual: Array, misfit_ratio: Array) -> Array:
+    """Log odds that damage or a cover hides what was built in each cell, shape (cells,).
+
+    Parameters
+    ----------
+    level_residual : ndarray, shape (cells,)
+        As of `UnitEvidence`.
+    misfit_ratio : ndarray, shape (cells,)
+        Residual of the pixels of each cell's worst unit over the median of all units.
+    """
+    by_level = RISK_OF_LEVEL * np.log(np.abs(level_residual) + RISK_FLOOR)
+    risk: Array = RISK_CONSTANT + by_level + RISK_OF_MISFIT * np.log(np.maximum(misfit_ratio, 1.0))
+    return risk
+
+
+def with_hidden_markers(evidence: UnitEvidence, tints: Array, n: int) -> UnitEvidence:
+    """Evidence in which cells beside a marker without its colour are likely to be covered too.
+
+    Parameters
+    ----------
+    tints : ndarray, shape (4,)
+        As of `MarkerColours`.
+    n : int
+        Units along a side.
+    """
+    hidden = 1 / (1 + np.exp(np.clip((tints - HIDDEN_TINT) / HIDDEN_TINT_SPREAD, -30, 30)))
+    beside = (hidden * _beside_markers(n)).max(axis=1)
+    return replace(evidence, risk_log_odds=evidence.risk_log_odds + RISK_BESIDE_HIDDEN * beside)
+
+
+@lru_cache
+def _beside_markers(n: int) -> npt.NDArray[np.bool_]:
+    """Whether each cell has a side in common with each marker, shape (cells, 4), markers clockwise."""
+    flat = unit_index(n).reshape(-1)
+    middles = np.stack([flat % n, flat // n], axis=1).reshape(-1, 4, 2).mean(axis=1)
+    markers = np.array([(0.5, 0.5), (n - 1.5, 0.5), (n - 1.5, n - 1.5), (0.5, n - 1.5)])
+    found: npt.NDArray[np.bool_] = np.abs(middles[:, None] - markers[None]).sum(axis=2) < 2.5
+    return found
 
 
 def light_levels(fit: PlateFit) -> LightLevels | None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from app.decoders.plate.confirm import Expected
 from app.decoding.frames import DecodePlates
 from app.errors import ProcessStopped, WaymarkError
 from app.families.family import FrameReader, FrameReading
@@ -14,11 +15,15 @@ from app.families.plate.frames import PlateFrames
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
 from app.formats.images import Frame, ImageHeader, ImageLimits, load_image
+from app.markers.reading import PlateReading
 from app.plots.annotated_frame import Outline, draw_outlines, encode_picture
+from app.sensors.camera import Camera
 from app.services.decoder_tasks import decoder_task
 from app.services.decodes.matching import FRAME_READERS
 from app.services.ports import Later
 
+PlatesOfFrames = Sequence[tuple[int, Sequence[PlateReading]]]
+"""Numbers of the frames of a drive, and the plates that each shows."""
 FrameSearch = Mapping[str, object]
 """What to look for in a frame: what each family's `FrameReader.search` returns, by the family's name."""
 _PICTURE = ("picture", "send frames at the camera's resolution, or crop them to the road")
@@ -95,6 +100,29 @@ def decode_frames(frames: tuple[tuple[FramePicture, FrameSearch], ...]) -> tuple
         except WaymarkError as error:
             results.append(error)
     return tuple(results)
+
+
+@decoder_task(*_PICTURE)
+def confirm_plates(frames: PlatesOfFrames) -> dict[int, list[PlateReading]]:
+    """Plates that the frames of a drive show together, as `confirm_drive`."""
+    from app.decoders.plate.accumulate import confirm_drive
+
+    return confirm_drive(frames)
+
+
+@decoder_task(*_PICTURE, is_long=False)
+def find_expected_plates(
+    picture: FramePicture, camera: Camera, expected: tuple[Expected, ...]
+) -> tuple[PlateReading, ...]:
+    """Plates that other frames of the drive show, where this frame should show them."""
+    from app.decoders.plate.follow_plate import expect_plate, find_expected
+
+    wanted = [expect_plate(one, camera) for one in expected]
+    if not any(wanted):
+        return ()
+    frame, _load_ms = _load(picture)
+    found = (find_expected(frame.pixels, one, camera) for one in wanted if one is not None)
+    return tuple(reading for reading in found if reading is not None)
 
 
 @decoder_task(*_PICTURE, is_long=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
@@ -12,7 +12,7 @@ from functools import partial
 
 import sqlalchemy as sa
 
-from app.decoders.plate.confirm import confirm_frames
+from app.decoders.plate.confirm import DriveFrame, list_expected, with_expected
 from app.decoders.plate.pose import locate_moving_plate, with_pose
 from app.decoding.declarations import CoarsePosition, DeclaredFrames, DecodeContext
 from app.decoding.frames import Match, PlateSearch, fix_from_match, fuse_fixes, with_registered_size
@@ -33,7 +33,15 @@ from app.sensors.camera import Camera
 from app.services.decodes.context import DecodeKind, DecodeRules
 from app.services.decodes.frame_documents import DriveNotes, ReadFrame, ReadMarker, frames_result
 from app.services.decodes.frame_poses import FramePlaces, FramePose, find_gaps
-from app.services.decodes.frame_tasks import FramePicture, FrameResult, FrameSearch, decode_frame, decode_frames
+from app.services.decodes.frame_tasks import (
+    FramePicture,
+    FrameResult,
+    FrameSearch,
+    confirm_plates,
+    decode_frame,
+    decode_frames,
+    find_expected_plates,
+)
 from app.services.decodes.matching import FRAME_READERS, NearbyMarkers, find_nearby_markers, match_reading
 from app.services.decodes.upload_path import Decoded, PendingSignal, Upload, UploadHandler, cancelled_on_error
 from app.services.decodes.video_tasks import read_frame_lists
@@ -315,7 +323,7 @@ class PendingArchive:
         self._search: tuple[NearbyMarkers, Camera | None, FrameSearch] | None = None
         self._places = FramePlaces(upload.context)
         self._ordinal = 0
-        self._with_plates: dict[int, tuple[ArchiveFrame, FrameResult]] = {}
+        self._results: dict[int, tuple[ArchiveFrame, FrameResult]] = {}
 
     def result(self) -> ArchiveSignal:
         """Decode all frames."""
@@ -331,6 +339,7 @@ class PendingArchive:
         while self._waiting:
             self._finish(self._waiting.popleft(), total)
         self._confirm()
+        self._find_expected()
         gaps, warnings = find_gaps([(frame.index, frame.captured_at) for frame in self._frames])
         notes = DriveNotes((*self._places.warnings, *warnings), gaps, receiver=self._places.receiver)
         return ArchiveSignal(self._frames, len(self._codebook), notes)
@@ -397,10 +406,10 @@ class PendingArchive:
         results = run.results(lambda: self._report(total))
         with self._database.read() as connection:
             self._frames += [self._matched(connection, frame, result) for frame, result in results]
-        self._with_plates |= {
+        self._results |= {
             frame.index: (replace(frame, picture=None), result)
             for frame, result in results
-            if isinstance(result, FrameResult) and any(one.certainty is not None for one in _plates(result))
+            if isinstance(result, FrameResult)
         }
         self._report(total)
 
@@ -419,17 +428,54 @@ class PendingArchive:
         self._upload.report(done, total, part)
 
     def _confirm(self) -> None:
-        """Match plates again that are tentative in single frames, and that several frames confirm together."""
+        """Match plates again that are unsure in single frames, and that several frames confirm together."""
+        shown = [(index, _plates(result)) for index, (_frame, result) in self._results.items()]
+        if any(
+            reading.symbols is not None or reading.certainty is not None for _, plates in shown for reading in plates
+        ):
+            self._replace_plates(self._processes.run(confirm_plates, shown, wait_s=self._upload.wait_s))
+
+    def _find_expected(self) -> None:
+        """Look for plates in the frames beside those that show them."""
+        cameras = {
+            index: frame.moment.context.camera_of(result.header) for index, (frame, result) in self._results.items()
+        }
+        plates = [DriveFrame(index, _plates(result), cameras[index]) for index, (_, result) in self._results.items()]
+        expected = {} if self._upload.context.is_thermal else list_expected(plates)
+        names = {self._results[index][0].name for index in expected}
+        waiting: deque[tuple[int, Pending[tuple[PlateReading, ...]]]] = deque()
+        found: dict[int, list[PlateReading]] = {}
+
+        def finish() -> None:
+            index, pending = waiting.popleft()
+            if readings := pending.result():
+                found[index] = with_expected(_plates(self._results[index][1]), readings)
+
+        for member in read_members(self._upload.file, self._rules.archives, only=names.__contains__) if names else ():
+            camera = cameras.get(member.index)
+            if member.index not in expected or member.error is not None or camera is None:
+                continue
+            picture = FramePicture(SpooledFile.of(member.data), limits=self._rules.images)
+            wanted = tuple(expected[member.index])
+            task = self._processes.submit(find_expected_plates, picture, camera, wanted, wait_s=self._upload.wait_s)
+            waiting.append((member.index, task))
+            if len(waiting) > self._rules.frames_in_flight:
+                finish()
+        while waiting:
+            finish()
+        self._replace_plates(found)
+
+    def _replace_plates(self, changed: Mapping[int, list[PlateReading]]) -> None:
+        """Match frames again whose plates other frames have changed."""
         places = {frame.index: place for place, frame in enumerate(self._frames)}
-        known = self._with_plates
-        confirmed = confirm_frames([(index, _plates(known[index][1]) if index in known else ()) for index in places])
         with self._database.read() as connection:
-            for index, plates in confirmed.items():
-                frame, result = known[index]
+            for index, plates in changed.items():
+                frame, result = self._results[index]
                 camera = frame.moment.context.camera_of(result.header)
                 others = tuple(one for one in result.readings if not isinstance(one, PlateReading))
-                readings = (*(with_pose(one, camera) for one in plates), *others)
-                self._frames[places[index]] = self._matched(connection, frame, replace(result, readings=readings))
+                result = replace(result, readings=(*(with_pose(one, camera) for one in plates), *others))
+                self._results[index] = frame, result
+                self._frames[places[index]] = self._matched(connection, frame, result)
 
     def _matched(self, connection: sa.Connection, frame: ArchiveFrame, result: FrameResult | WaymarkError) -> ReadFrame:
         moment = frame.moment
