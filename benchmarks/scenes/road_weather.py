@@ -248,7 +248,7 @@ def wet(scene: PlateScene, background: Image, water: Water, lamps: tuple[Lamp, .
     linear = linear_from_srgb()[background]
     sky = water.sky * _light(scene, linear)
     mirrored = _mirrored(scene, ground, water.road_slope, sky, lamps, 1 / night)
-    shown = linear + (mirrored - linear * water.darkening) * road[..., None]
+    shown = np.asarray(linear + (mirrored - linear * water.darkening) * road[..., None], np.float32)
     face = first.face
     emission = _mirrored(scene, _ground_of_texels(first), water.plate_slope, sky * night, lamps, 1.0)
     emission = emission if face.emission is None else emission + face.emission
