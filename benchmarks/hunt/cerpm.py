@@ -267,8 +267,8 @@ def _judge(p: Parameters, drive: _Drive, path: Lane, oracle: Lane) -> Outcome:
         alone = bool(p["without_track"]) and bool(p["without_sides"])  # nothing shows the direction of travel
         said = path.refusal or ("blocked by the track" if blocked else f"{found.coverage if found else 0:.0%} covered")
         missed = possible and not alone and _is_sure_of_lane(p, drive)
-        share = found.coverage if found is not None and not blocked else 0.0
-        return Outcome(Kind.MISSED if missed else Kind.BEYOND, 1.0, said, read=share if missed else None)
+        covered = found.coverage if found is not None and not blocked else 0.0
+        return Outcome(Kind.MISSED if missed else Kind.BEYOND, 1.0, said, read=covered if missed else None)
     sure = found.confidence > 0.5
     step = max(round(_EVERY_M / 0.25), 1)
     readings = [
