@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 from benchmarks.readme import (
-    GAP, PAGES, SHORT_MARK, fill_blocks, fill_excerpt, find_stamps, read_sections, stamp_sections,
+    GAP,
+    PAGES,
+    SHORT_MARK,
+    fill_blocks,
+    fill_excerpt,
+    find_stamps,
+    read_sections,
+    stamp_sections,
 )  # fmt: skip
 from tests.http import WITHIN_S
 from tests.machine import require_tool
