@@ -9,7 +9,11 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     """One line a group and way of reading it."""
     reports = [one for found in terminalreporter.stats.values() for one in found if hasattr(one, "user_properties")]
     lines = [
-        str(text) for one in reports if one.when == "call" for name, text in one.user_properties if name == "corpus"
+        str(text)
+        for one in reports
+        if getattr(one, "when", "") == "call"
+        for name, text in one.user_properties
+        if name == "corpus"
     ]
     if lines:
         terminalreporter.section("corpus")
