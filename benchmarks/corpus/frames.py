@@ -176,7 +176,7 @@ def read_roads(folder: Path, truth: Sequence[Any]) -> Counts:
             "at half size": _halved(image, nowhere, camera)[0],
         }
         for way, view in views.items():
-            grey = np.asarray(cv2.cvtColor(view, cv2.COLOR_BGR2GRAY))
+            grey = np.asarray(cv2.cvtColor(view, cv2.COLOR_BGR2GRAY), np.uint8)
             read: list[Any] = [*decode_plates(view), *decode_plates(view, codebook=codes)]
             read += [*decode_plates(grey, thermal=True), *decode_fiducials(view)]
             wrong = [f"{path.name}: {one.code}" for one in read if one.code is not None]

@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -146,7 +147,7 @@ _VIEWS: Mapping[str, _View] = {
 }
 
 
-def _record_view(folder: Path, view: _View, rng: np.random.Generator) -> list[dict[str, Any]]:
+def _record_view(view: _View, folder: Path, rng: np.random.Generator) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     while len(rows) < FRAMES:
         candidate = CANDIDATES[len(rows) % len(CANDIDATES)]
@@ -268,7 +269,7 @@ _COURSES: Mapping[str, Sequence[_Course]] = {
 }
 
 
-def _record_course(folder: Path, courses: Sequence[_Course], rng: np.random.Generator) -> list[dict[str, Any]]:
+def _record_course(courses: Sequence[_Course], folder: Path, rng: np.random.Generator) -> list[dict[str, Any]]:
     rows = []
     for number, course in enumerate(courses):
         drive = _drive(course, rng)
@@ -399,13 +400,13 @@ def list_recorders() -> dict[str, Callable[[Path, np.random.Generator], list[dic
     """How each group is recorded, by its name."""
     recorders: dict[str, Callable[[Path, np.random.Generator], list[dict[str, Any]]]] = {}
     for name, view in _VIEWS.items():
-        recorders[name] = lambda folder, rng, view=view: _record_view(folder, view, rng)
+        recorders[name] = partial(_record_view, view)
     recorders |= {"plates-drives": _record_drives, "plates-thermal": _record_thermal, "plates-video": _record_video}
     for name, courses in _COURSES.items():
-        recorders[name] = lambda folder, rng, courses=courses: _record_course(folder, courses, rng)
+        recorders[name] = partial(_record_course, courses)
     recorders["magnets-wheel-turns"] = _record_turns
     for name, options in _RADIO.items():
-        recorders[name] = lambda folder, rng, options=options: _record_logs(folder, rng, **options)
+        recorders[name] = partial(_record_logs, **options)
     return recorders | {"signs-photos": _list_signs, "roads": _list_roads}
 
 
