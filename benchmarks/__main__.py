@@ -11,7 +11,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from app.decoders.magnet.decoder import VERSION as MAGNETS
+from app.decoders.plate import DECODER_VERSION as PLATES
+from benchmarks.readme import stamp_sections
+
 OUT = Path("bench-out")
+VERSIONS = {"plates": PLATES, "magnets": MAGNETS}
+"""Decoders whose version each of a benchmark's tables states."""
 
 
 def main() -> int:
@@ -55,6 +61,8 @@ def _run(name: str, command: list[str], write: Callable[[str], object]) -> bool:
         print(line, end="", flush=True)
         lines.append(line)
     text = "".join(lines)
+    if name in VERSIONS:
+        text = stamp_sections(text, VERSIONS[name])
     if text.lstrip().startswith("### "):
         write(f"{text.lstrip()}\n")
     elif "\n### " in text:

@@ -16,6 +16,7 @@ README = ROOT / "README.md"
 DEMO = ROOT / "docs" / "demo.md"
 PAGES = (DEMO, ROOT / "docs" / "benchmarks.md")
 SHORT_MARK = "*Short mode: a sample of the scenes.*"
+_STAMP = re.compile(r"^\*Decoder: `(?P<family>[a-z]+)[/-](?P<number>\d+)`\.\*$", re.MULTILINE)
 GAP = "..."
 """Stands in the README's lines of the demo where others are left out."""
 _BLOCK = re.compile(r"(<!-- bench:(?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
@@ -29,6 +30,19 @@ def read_sections(text: str) -> dict[str, str]:
     parts = re.split(r"^### ([\w-]+)\n", text, flags=re.MULTILINE)
     mark = f"{SHORT_MARK}\n\n" if re.search(r"\bshort mode\b", text, flags=re.IGNORECASE) else ""
     return {name: mark + _without_lists(body) for name, body in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+def stamp_sections(text: str, version: str) -> str:
+    """A benchmark's output with the decoder's version below each heading of a section."""
+    return re.sub(r"^(### [\w-]+\n)", rf"\1\n*Decoder: `{version}`.*\n", text, flags=re.MULTILINE)
+
+
+def find_stamps(page: str) -> dict[str, set[int]]:
+    """Versions that the tables of a page state, by family of decoders: more than one are mixed."""
+    found: dict[str, set[int]] = {}
+    for stamp in _STAMP.finditer(page):
+        found.setdefault(stamp["family"], set()).add(int(stamp["number"]))
+    return found
 
 
 def fill_blocks(page: str, sections: dict[str, str]) -> str:

@@ -9,7 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.readme import GAP, PAGES, SHORT_MARK, fill_blocks, fill_excerpt, read_sections
+from benchmarks.readme import (
+    GAP,
+    PAGES,
+    SHORT_MARK,
+    fill_blocks,
+    fill_excerpt,
+    find_stamps,
+    read_sections,
+    stamp_sections,
+)  # fmt: skip
 from tests.http import WITHIN_S
 from tests.machine import require_tool
 from tests.tours import assert_same, read_blocks, run_blocks
@@ -117,3 +126,14 @@ def test_pictures_of_tutorials_are_small_and_shown() -> None:
     for picture in pictures:
         assert picture.stat().st_size <= 150_000, picture.name
         assert f"images/tutorials/{picture.name}" in texts, f"{picture.name} is not shown"
+
+
+def test_tables_state_the_decoder_that_made_them_and_none_mixes_versions() -> None:
+    text = stamp_sections("### trials\n\n| a |\n", "plate/8") + stamp_sections("### recall\n\n| b |\n", "matched-9")
+    page = fill_blocks(
+        "<!-- bench:trials -->\n<!-- /bench -->\n<!-- bench:recall -->\n<!-- /bench -->", read_sections(text)
+    )
+    assert find_stamps(page) == {"plate": {8}, "matched": {9}}
+    assert find_stamps(page + "\n*Decoder: `plate/7`.*\n")["plate"] == {7, 8}
+    stated = find_stamps((ROOT / "docs" / "benchmarks.md").read_text())
+    assert all(len(versions) == 1 for versions in stated.values()), stated

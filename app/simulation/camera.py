@@ -377,8 +377,12 @@ def directions(scene: PlateScene, cols: Floats, rows: Floats) -> Floats:
     camera = scene.camera
     points = np.stack([cols, rows], axis=-1).astype(np.float64)
     if camera.distortion:
-        ideal = cv2.undistortPoints(points.reshape(-1, 1, 2), camera.matrix, np.array(camera.distortion))
-        ideal = ideal.reshape(points.shape)
+        # five steps, OpenCV's default, are up to 40 px short on the wide lenses of the rational model
+        both = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
+        stop = (cv2.TERM_CRITERIA_COUNT, 5, 0.01) if len(camera.distortion) < 8 else (both, 100, 1e-9)
+        ideal = cv2.undistortPoints(
+            points.reshape(-1, 1, 2), camera.matrix, np.array(camera.distortion), None, None, None, stop
+        ).reshape(points.shape)
     else:
         ideal = (points - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
     rotation = scene.camera_from_ground

@@ -8,6 +8,7 @@ the same way, and drawn. ``--keep`` adds these scenes to the kept ones, which ``
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -18,12 +19,13 @@ import numpy as np
 from benchmarks.hunt.clusters import Cluster, find_clusters
 from benchmarks.hunt.families import FAMILIES
 from benchmarks.hunt.kept import evaluate_kept, keep, read_kept, update_kept
-from benchmarks.hunt.scenes import FAILURES, Family, Kind, Scene, describe
+from benchmarks.hunt.scenes import FAILURES, Bound, Family, Kind, Scene, describe
 from benchmarks.hunt.search import search
 from benchmarks.hunt.shrink import shrink
 
 _BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0001)
 _SHOWN = 4  # parameters that explain most, clusters of a kind
+_SHOWN_DECILES, _MIN_DECILE = 8, 8  # tenths of parameters' values, and scenes in one at least
 
 
 def main() -> None:
@@ -51,6 +53,7 @@ def main() -> None:
     scenes = search(args.family, args.seed, minutes=args.minutes, processes=args.processes, most=args.scenes)
     print(f"\n### hunt-{args.family}\n\n{_heading(scenes, time.monotonic() - start)}")
     print(f"\n{_counts(scenes)}\n\n{_reliability(scenes)}\n\n{_coverage(scenes)}")
+    print(_worst_deciles(family.bounds, scenes))
     for kind in FAILURES:
         clusters, importance = find_clusters(family.bounds, scenes, kind)
         if clusters:
@@ -92,6 +95,30 @@ def _coverage(scenes: Sequence[Scene]) -> str:
         f"{np.mean(z < 2):.1%} below 2 (95.4 %), {np.mean(z < 3):.1%} below 3 (99.7 %); median of the squares "
         f"{np.median(squared):.2f} (0.45), mean {np.mean(squared):.2f} (1)."
     )
+
+
+def _worst_deciles(bounds: Mapping[str, Bound], scenes: Sequence[Scene]) -> str:
+    """Share read of what the limit allows: in the worst tenth of the scenes, and of each parameter's values."""
+    judged = [scene for scene in scenes if scene.outcome.read is not None]
+    if len(judged) < 2 * _MIN_DECILE:
+        return ""
+    read = np.array([scene.outcome.read for scene in judged], float)
+    worst = np.sort(read)[: math.ceil(len(read) / 10)]
+    rows = []
+    for name, bound in bounds.items():
+        values = np.array([scene.parameters[name] for scene in judged])
+        varied = np.flatnonzero(values != bound.simple)
+        cuts = np.unique(np.quantile(values[varied], np.linspace(0, 1, 11))) if len(varied) else np.zeros(0)
+        for low, high in pairwise(cuts):
+            inside = varied[(values[varied] >= low) & (values[varied] <= high)]
+            if len(inside) >= _MIN_DECILE:
+                rows.append((float(read[inside].mean()), f"{name} {low:.3g} to {high:.3g}", len(inside)))
+    table = [f"| {text} | {count} | {share:.3f} |" for share, text, count in sorted(rows)[:_SHOWN_DECILES]]
+    return "\n".join([
+        f"Read of what the limit allows: {read.mean():.3f} in {len(read)} scenes, {worst.mean():.3f} in the worst "
+        "tenth of them. Tenths of a parameter's values with the lowest shares:\n",
+        "| values | scenes | read |", "|---|--:|--:|", *table,
+    ])  # fmt: skip
 
 
 def _print_clusters(

@@ -171,7 +171,7 @@ def _simulate(p: Parameters, seed: int) -> _Drive | None:
     passed = drive_past(lane, sent, rng, sign=sign, radio=radio, driver=driver, receiver=receiver)
     verification = verify_packets(list(passed.packets), keys_for(sent))
     heard = markers_from_merged(merge_markers(verification.packets, {}, None))
-    if p.get("lines_registered") and p.get("lane_beside"):
+    if p["lines_registered"] and p["lane_beside"]:
         heard = replace(heard, line=np.array([line[number] for number in heard.number.tolist()]))
     numbers = set(heard.number.tolist()) - {int(honest.number[k]) for k in dishonest}
     chainage = honest.chainage_m[np.isin(honest.number, list(numbers))]
@@ -186,7 +186,7 @@ def _with_lane_beside(
 ) -> tuple[InstalledMarkers, dict[int, int]]:
     """Markers of a lane beside, which shares a line with the driven one, and the line on which each is registered."""
     line = dict(zip(own.number.tolist(), own.side.tolist(), strict=True))
-    if not p.get("lane_beside"):  # kept scenes are older
+    if not p["lane_beside"]:
         return own, line
     on_left = p["lane_beside"] == 1
     normal = np.stack([-np.sin(lane.yaw_rad), np.cos(lane.yaw_rad)], 1) * p["width_m"]
@@ -211,7 +211,7 @@ def _with_lane_beside(
 
 def _is_sure_of_lane(p: Parameters, drive: _Drive) -> bool:
     """Whether the receiver can show in which of two lanes the vehicle is."""
-    return not p.get("lane_beside") or (not p["without_track"] and drive.receiver.reported_accuracy_m < TRUSTED_TRACK_M)
+    return not p["lane_beside"] or (not p["without_track"] and drive.receiver.reported_accuracy_m < TRUSTED_TRACK_M)
 
 
 def _with_mistakes(
@@ -267,22 +267,25 @@ def _judge(p: Parameters, drive: _Drive, path: Lane, oracle: Lane) -> Outcome:
         alone = bool(p["without_track"]) and bool(p["without_sides"])  # nothing shows the direction of travel
         said = path.refusal or ("blocked by the track" if blocked else f"{found.coverage if found else 0:.0%} covered")
         missed = possible and not alone and _is_sure_of_lane(p, drive)
-        return Outcome(Kind.MISSED if missed else Kind.BEYOND, 1.0, said)
+        covered = found.coverage if found is not None and not blocked else 0.0
+        return Outcome(Kind.MISSED if missed else Kind.BEYOND, 1.0, said, read=covered if missed else None)
     sure = found.confidence > 0.5
     step = max(round(_EVERY_M / 0.25), 1)
     readings = [
         (float(c), bool(o <= TOLERANCE_M)) for c, o in zip(found.confidence[::step], found.off_m[::step], strict=True)
     ]
     squared = [(float((o / s) ** 2), 1) for o, s in zip(found.off_m[::step], found.sigma_m[::step], strict=True)]
-    worst = float(found.off_m[sure].max(initial=0.0))
+    worst, share = float(found.off_m[sure].max(initial=0.0)), found.coverage if possible else None
     if worst > _WRONG_M and possible and limit is not None and limit.worst_m < _LIMIT_WRONG_M:
-        return Outcome(Kind.WRONG, worst, f"{worst:.2f} m off, the oracle {limit.worst_m:.2f} m", readings, squared)
+        return Outcome(
+            Kind.WRONG, worst, f"{worst:.2f} m off, the oracle {limit.worst_m:.2f} m", readings, squared, share
+        )
     z = found.off_m / found.sigma_m
     far = (z > _FAR_Z) & (found.off_m > _FAR_M)
     if far.mean() > _MAX_FAR_SHARE:
         said = f"{far.mean():.0%} of the path is beyond 3 sigma, up to {found.off_m[far].max():.2f} m"
-        return Outcome(Kind.OVERCONFIDENT, float(z.max()), said, readings, squared)
-    return Outcome(Kind.RIGHT, worst, f"RMS {found.rms_m:.3f} m", readings, squared)
+        return Outcome(Kind.OVERCONFIDENT, float(z.max()), said, readings, squared, share)
+    return Outcome(Kind.RIGHT, worst, f"RMS {found.rms_m:.3f} m", readings, squared, share)
 
 
 def _judge_shifted(p: Parameters, drive: _Drive, path: Lane, found: PlaceErrors | None, blocked: bool) -> Outcome:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.hunt.families import FAMILIES
-from benchmarks.hunt.scenes import Kind, Outcome, Scene
+from benchmarks.hunt.scenes import Kind, Outcome, Scene, simplest
 
 FOLDER = Path(__file__).parent / "kept_scenes"
 
@@ -26,12 +26,12 @@ class KeptScene:
 
 
 def read_kept(family: str) -> list[KeptScene]:
-    """The kept scenes of a family, in the order found."""
-    path = FOLDER / f"{family}.json"
+    """The kept scenes of a family, in the order found; parameters that are newer than a scene are the simplest."""
+    path, simple = FOLDER / f"{family}.json", simplest(FAMILIES[family].bounds)
     if not path.exists():
         return []
     return [
-        KeptScene(one["seed"], one["parameters"], Kind(one["kind"]), Kind(one["now"]))
+        KeptScene(one["seed"], {**simple, **one["parameters"]}, Kind(one["kind"]), Kind(one["now"]))
         for one in json.loads(path.read_text())
     ]
 

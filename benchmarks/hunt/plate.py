@@ -1,4 +1,4 @@
-"""Scenes of plates: a plate under light, shade, dirt and wear, a camera, and what is read from the frame."""
+"""Scenes of plates: a plate under light, shade, weather, dirt and wear, a camera, and what is read from the frame."""
 
 from __future__ import annotations
 
@@ -23,8 +23,21 @@ from benchmarks.plates.evaluate import find_right
 from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
 from benchmarks.plates.schemes import CANDIDATES, draw_places
 from benchmarks.plates.views import draw_background
+from benchmarks.scenes.road_weather import (
+    Water,
+    dusk,
+    lay,
+    mirrored_lamp,
+    sand,
+    shaken,
+    snow,
+    wet,
+    wide_camera,
+)
 
 _BY_HAND = "by hand"
+_LAMPS = ((0.15, 1.0, 0.4), (0.05, 0.05, 1.0), (0.05, 0.55, 1.0), (0.9, 1.0, 1.0))
+"""Colours of lamps in blue, green, red: green, red, amber, white."""
 PLATE = {
     "scheme": Bound(0, len(CANDIDATES) - 1, 2, "schemes of `benchmarks.plates.schemes`", whole=True),
     "contrast_loss": Bound(0, 0.5, 0, "paint fades to half of its contrast", plain=0.6),
@@ -72,17 +85,36 @@ CAMERA = {
     "blue_gain": Bound(0.7, 1.35, 1, "white balance", plain=0.4),
     "jpeg_quality": Bound(30, 96, 90, "4:2:0 of dash cameras and of uplinks", whole=True),
 }
+WEATHER = {
+    "snow": Bound(0, 0.8, 0, "share of the plate under it; with more, no method could", plain=0.85),
+    "sand": Bound(0, 0.95, 0, "share of the plate under it", plain=0.85),
+    "sand_depth": Bound(0.3, 1, 0.85, "opacity of its middle: dust to a drift"),
+    "layer_from_deg": Bound(0, 360, 90, "side that it comes from"),
+    "layer_bank": Bound(0, 1, 0.5, "patches anywhere to one straight edge"),
+    "layer_patch_m": Bound(0.05, 0.4, 0.15, _BY_HAND, logarithmic=True),
+    "wet": switch("a film of water that mirrors the sky", plain=0.8),
+    "lamp": Bound(0, 1.5, 0, "radiance of a lamp that the film mirrors, as a share of saturation", plain=0.6),
+    "lamp_colour": Bound(0, len(_LAMPS) - 1, 0, "traffic lights, brake lights, headlights", whole=True),
+    "lamp_right_m": Bound(-0.3, 0.3, 0, "its image beside the plate's middle"),
+    "lamp_along_m": Bound(-0.3, 0.3, 0, "its image ahead of the plate's middle"),
+    "light": Bound(0.001, 1, 1, "share of the day's, to the end of civil twilight", logarithmic=True, plain=0.85),
+    "shake": Bound(0, 12, 0, "times an ordinary road's, to a pothole", plain=0.7),
+    "bend": Bound(0.1, 1, 0, "of the lens: 1 is an equidistant fisheye", plain=0.85),
+    "wide_fov_deg": Bound(90, 130, 110, "of such a lens"),
+    "undeclared": switch("uploads need not declare their camera", plain=0.8),
+}
 _MIN_ROWS = 16.0  # [px] below it a miss is the physical limit's; source: 1.25 px a unit of 10 x 10, by hand
 _ROAD_REFLECTANCE = 0.22  # source: `PlateScene`
 
 
 class _Shot(NamedTuple):
     image: np.ndarray
-    scene: PlateScene
+    scene: PlateScene  # without its weather, as is the photo
     truth: FaceTruth
     codes: list[PlateCode]
     conditions: Conditions
     background: np.ndarray
+    camera: Camera | None  # as declared
 
 
 class PlateScenes:
@@ -92,7 +124,7 @@ class PlateScenes:
     reads is beyond the limit. The badness of a wrong reading is its confidence, of a missed one its height in rows.
     """
 
-    bounds: Mapping[str, Bound] = {**PLATE, **LIGHT, **CAMERA}
+    bounds: Mapping[str, Bound] = {**PLATE, **LIGHT, **CAMERA, **WEATHER}
 
     def evaluate(self, parameters: Parameters, seed: int) -> Outcome:
         """Read a frame alone and with the registry, and compare the readings with the true plate."""
@@ -100,7 +132,7 @@ class PlateScenes:
         shot = _simulate(parameters, seed)
         if shot is None:
             return Outcome(Kind.BEYOND, detail="the plate is not in view in this size")
-        readings = decode_plates(shot.image, camera=shot.scene.camera)
+        readings = decode_plates(shot.image, camera=shot.camera)
         hit, wrong = find_right(readings, shot.codes[0], shot.truth)
         sure = [(hit.confidence, True)] if hit is not None else []
         for reading in readings:
@@ -108,20 +140,25 @@ class PlateScenes:
                 sure.append((reading.confidence, reading.likely_code.digits == shot.codes[0].digits))
         sure += [(reading.confidence, False) for reading in readings if reading.code and reading.code.digits in wrong]
         known, known_wrong = find_right(
-            decode_plates(shot.image, camera=shot.scene.camera, codebook=tuple(shot.codes)), shot.codes[0], shot.truth
+            decode_plates(shot.image, camera=shot.camera, codebook=tuple(shot.codes)), shot.codes[0], shot.truth
         )
         if wrong or known_wrong:
             said = f"read as {(*wrong, *known_wrong)[0]} in place of {shot.codes[0].digits}"
             return Outcome(Kind.WRONG, 1.0, said + ("" if wrong else " with the registry"), sure)
         if hit is not None:
-            return Outcome(Kind.RIGHT, detail=f"{shot.truth.height_px:.0f} rows", sure=sure)
-        oracle = "with the registry" if known is not None else "as an ArUco tag" if _reads_aruco(shot, seed) else ""
+            return Outcome(Kind.RIGHT, detail=f"{shot.truth.height_px:.0f} rows", sure=sure, read=1.0)
+        oracle = (
+            "with the registry"
+            if known is not None
+            else "as an ArUco tag"
+            if _reads_aruco(shot, parameters, seed)
+            else ""
+        )
         if not oracle or shot.truth.height_px < _MIN_ROWS:
             return Outcome(Kind.BEYOND, detail="not read by the oracle", sure=sure)
         why = next((reading.reason for reading in readings if reading.reason), "no plate found")
-        return Outcome(
-            Kind.MISSED, shot.truth.height_px, f"{shot.truth.height_px:.0f} rows, read {oracle}: {why}", sure
-        )
+        said = f"{shot.truth.height_px:.0f} rows, read {oracle}: {why}"
+        return Outcome(Kind.MISSED, shot.truth.height_px, said, sure, read=0.0)
 
     def draw(self, parameters: Parameters, seed: int, path: Path) -> None:
         """Write the part of the frame around the plate as PNG."""
@@ -139,18 +176,44 @@ def _simulate(p: Parameters, seed: int) -> _Shot | None:
     candidate = CANDIDATES[int(p["scheme"])]
     codes = [candidate.code(*place) for place in draw_places(rng)]
     conditions = _conditions(p, draw_look(rng), seed)
-    camera = Camera.from_field_of_view(
-        1920, 1080, p["fov_deg"], height_m=p["height_m"], depression_deg=p["depression_deg"],
-        azimuth_deg=p["azimuth_deg"], roll_deg=p["roll_deg"],
-    )  # fmt: skip
-    camera = replace(camera, distortion=(0.0, 0.0, p["decentred"], -p["decentred"] / 2), readout_s=p["readout_s"])
+    camera = _camera(p)
     face = plate_face(codes[0], candidate.geometry, conditions.look, conditions.wear, np.random.default_rng([seed, 3]))
     scene = _placed(p, camera, face, conditions)
     if scene is None:
         return None
     background = draw_background(camera, rng)
-    image = render_plate_scene(scene, background, np.random.default_rng([seed, 4])).image
-    return _Shot(image, scene, face_truth(scene, scene.faces[0]), codes, conditions, background)
+    weather, photo = _under_weather(p, scene, background, seed)
+    image = render_plate_scene(weather, photo, np.random.default_rng([seed, 4])).image
+    truth = face_truth(weather, weather.faces[0])
+    return _Shot(image, scene, truth, codes, conditions, background, None if p["undeclared"] else camera)
+
+
+def _camera(p: Parameters) -> Camera:
+    mount = {name: p[name] for name in ("height_m", "depression_deg", "azimuth_deg", "roll_deg")}
+    if p["bend"]:
+        camera = wide_camera(1920, 1080, p["wide_fov_deg"], p["bend"], **mount)
+    else:
+        camera = Camera.from_field_of_view(1920, 1080, p["fov_deg"], **mount)
+        camera = replace(camera, distortion=(0.0, 0.0, p["decentred"], -p["decentred"] / 2))
+    return replace(camera, readout_s=p["readout_s"])
+
+
+def _under_weather(
+    p: Parameters, scene: PlateScene, background: np.ndarray, seed: int
+) -> tuple[PlateScene, np.ndarray]:
+    """The scene and the photo behind it in its weather: what lies on the plate, then water, then light and shaking."""
+    side = {"from_deg": p["layer_from_deg"], "patch_m": p["layer_patch_m"]}
+    scene, background = lay(scene, background, sand(p["sand"], seed, depth=p["sand_depth"], **side))
+    scene, background = lay(scene, background, snow(p["snow"], seed + 1, bank=p["layer_bank"], **side))
+    if p["wet"]:
+        blue, green, red = (p["lamp"] * share for share in _LAMPS[int(p["lamp_colour"])])
+        lamp = mirrored_lamp(scene, (blue, green, red), right_m=p["lamp_right_m"], along_m=p["lamp_along_m"])
+        scene, background = wet(scene, background, Water(), (lamp,) if p["lamp"] else ())
+    if p["light"] < 1 and scene.night_light is None:
+        scene = dusk(scene, p["light"])
+    if p["shake"]:
+        scene = shaken(scene, p["shake"], np.random.default_rng([seed, 5]))
+    return scene, background
 
 
 def _conditions(p: Parameters, look: PlateLook, seed: int) -> Conditions:
@@ -191,9 +254,9 @@ def _placed(p: Parameters, camera: Camera, face: Face, conditions: Conditions) -
     return at(best[1]) if best is not None and best[0] < 0.1 else None
 
 
-def _reads_aruco(shot: _Shot, seed: int) -> bool:
+def _reads_aruco(shot: _Shot, p: Parameters, seed: int) -> bool:
     family = FAMILIES[0]
     face = tag_face(family, 7, shot.conditions, np.random.default_rng([seed, 3]))
     scene = replace(shot.scene, faces=(replace(shot.scene.faces[0], face=face),))
-    image = render_plate_scene(scene, shot.background, np.random.default_rng([seed, 4])).image
+    image = render_plate_scene(*_under_weather(p, scene, shot.background, seed), np.random.default_rng([seed, 4])).image
     return reads_tag(family, 7, image, shot.truth)

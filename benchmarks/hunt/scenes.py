@@ -84,6 +84,7 @@ class Outcome:
     sure: list[tuple[float, bool]] = field(default_factory=list)
     # normalised squared error of each estimate and its degrees of freedom (NEES)
     squared: list[tuple[float, int]] = field(default_factory=list)
+    read: float | None = None  # share read of what the physical limit allows; None where it allows nothing
 
 
 class Family(Protocol):
@@ -116,6 +117,11 @@ def draw_parameters(bounds: Mapping[str, Bound], seed: int) -> dict[str, float]:
     """The parameters of a scene; they depend on the seed alone."""
     rng = np.random.default_rng([seed, 1])
     return {name: bound.draw(rng) for name, bound in bounds.items()}
+
+
+def simplest(bounds: Mapping[str, Bound]) -> dict[str, float]:
+    """The parameters of the simplest scene."""
+    return {name: bound.simple for name, bound in bounds.items()}
 
 
 def describe(bounds: Mapping[str, Bound], parameters: Parameters) -> str:

@@ -94,10 +94,36 @@ def _scrap(rng: np.random.Generator) -> Floats:
     return np.hstack([place, strength * (axis + rng.normal(0, 0.5, (7, 3)))])
 
 
+def _slab_joint(rng: np.random.Generator) -> Floats:
+    """A joint of concrete slabs: dowels along the lane, 32 by 450 mm, every 30 cm, 12 cm deep, each magnetised anew."""
+    along = np.linspace(-0.18, 0.18, 5)
+    dowels = []
+    for left in np.arange(-1.8, 1.81, 0.3):
+        place = np.stack([along, left + 0 * along, np.full(5, -0.12)], 1)
+        moment = rng.normal((0, 0, -0.02), (0.5, 0.06, 0.06)) / 5
+        dowels.append(np.hstack([place, np.tile(moment, (5, 1))]))
+    return np.concatenate(dowels)
+
+
+def _tram_rails(rng: np.random.Generator) -> Floats:
+    """Sixty metres of grooved rails, 60 kg/m, in the road; their magnetisation changes from metre to metre."""
+    step = 0.08
+    along = np.arange(-30, 30, step)
+    rails = []
+    for left in (-0.7175, 0.7175):
+        place = np.stack([along, np.full(along.size, left), np.full(along.size, -0.06)], 1)
+        knots = np.cumsum(rng.normal(0, 0.5, (62, 3)), axis=0) + rng.normal(0, (6, 2, 2))
+        slow = np.stack([np.interp(along, np.arange(62) - 31, column) for column in knots.T], 1)  # [A m2/m]
+        rails.append(np.hstack([place, slow * step]))
+    return np.concatenate(rails)
+
+
 KINDS: dict[str, Callable[[np.random.Generator], Floats]] = {
     "car": _car, "manhole cover": _cover, "bridge joint": _joint, "rebar": _rebar, "steel plate": _plate,
-    "bolt": _bolt, "scrap": _scrap,
+    "bolt": _bolt, "scrap": _scrap, "slab joint": _slab_joint, "tram rails": _tram_rails,
 }  # fmt: skip
+SCATTERED = ("car", "manhole cover", "bridge joint", "rebar", "steel plate", "bolt", "scrap")
+"""Kinds that lie about one by one; slab joints come in rows, and rails run along the road."""
 
 
 Draw = Callable[[Clutter, Road, np.random.Generator], Floats]
@@ -145,11 +171,15 @@ def town_clutter(start_m: float, end_m: float, rng: np.random.Generator) -> list
 
 
 def ferrous_clutter(start_m: float, end_m: float, spacing_m: float, rng: np.random.Generator) -> list[Clutter]:
-    """One object after the other, of every kind in turn, all driven over but the cars."""
-    kinds = list(KINDS)
+    """One object after the other, of every scattered kind in turn, all driven over but the cars."""
     found = []
     for i, at in enumerate(np.arange(start_m, end_m, spacing_m)):
-        kind = kinds[i % len(kinds)]
+        kind = SCATTERED[i % len(SCATTERED)]
         left = float(rng.choice((-1, 1)) * rng.uniform(1.9, 2.8)) if kind == "car" else float(rng.uniform(-0.9, 0.9))
         found.append(Clutter(kind, float(at), left))
     return found
+
+
+def slab_joints(start_m: float, end_m: float, slab_m: float) -> list[Clutter]:
+    """Joints of the slabs of a concrete road, evenly apart."""
+    return [Clutter("slab joint", float(at), 0.0) for at in np.arange(start_m, end_m, slab_m)]

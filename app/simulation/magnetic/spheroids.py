@@ -233,7 +233,27 @@ def _loose(
     return Spheroid((0.0, 0.0, up_m), _magnetised(axis), half_length_m, half_width_m, _magnetised(permanent_am))
 
 
+def _slab_joint(rng: np.random.Generator) -> list[Spheroid]:
+    """Thirteen dowels along the lane, 32 by 450 mm."""
+    return [
+        Spheroid((0.0, left, -0.12), _ALONG, 0.225, 0.016, _magnetised(rng.normal(0, (2000, 250, 250))))
+        for left in np.arange(-1.8, 1.81, 0.3).tolist()
+    ]
+
+
+def _tram_rails(rng: np.random.Generator) -> list[Spheroid]:
+    """Two rails of 76 cm2, in pieces of a metre, each magnetised a little differently from the last."""
+    pieces = []
+    for left in (-0.7175, 0.7175):
+        slow_am = np.cumsum(rng.normal(0, 120, (60, 3)), axis=0) + rng.normal(0, (1400, 450, 450))
+        pieces += [
+            Spheroid((at + 0.5, left, -0.06), _ALONG, 0.5, 0.06, _magnetised(one))
+            for at, one in zip(range(-30, 30), slow_am, strict=True)
+        ]
+    return pieces
+
+
 SHAPES: dict[str, Callable[[np.random.Generator], list[Spheroid]]] = {
     "car": _car, "manhole cover": _cover, "bridge joint": _joint, "rebar": _rebar, "steel plate": _plate,
-    "bolt": _bolt, "scrap": _scrap,
+    "bolt": _bolt, "scrap": _scrap, "slab joint": _slab_joint, "tram rails": _tram_rails,
 }  # fmt: skip

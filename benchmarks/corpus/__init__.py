@@ -1,0 +1,1 @@
+"""Recorded inputs with a promise: so many are read at least, and none wrongly."""
