@@ -32,6 +32,8 @@ TASKS = (
 DECODERS = (
     "app.decoders.magnet.decoder",
     "app.decoders.magnet.recording_check",
+    "app.decoders.plate.accumulate",
+    "app.decoders.plate.follow_plate",
     "app.decoders.plate.print_grade",
     "app.decoders.plate.reader",
     "app.decoders.plate.video_search",

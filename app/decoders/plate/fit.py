@@ -409,7 +409,7 @@ class PlateFit:
         return math.sqrt(product / max(larger, 1e-300)) / len(self.units)
 
 
-_COARSE, _FINE = Stage(1.8, 1, 6, is_coarse=True), Stage(2.8, 2, 4)
+_COARSE, _FINE = Stage(1.8, 1, 6, is_coarse=True), Stage(2.8, 3, 4)
 """Of colour frames: two, then three pixels a unit (decision record 0010, rule 3)."""
 _THERMAL_COARSE, _THERMAL_FINE = Stage(2.4, 2, 6, is_coarse=True), Stage(3.5, 4, 4)
 """Of thermal frames, whose plates are few and faint."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, cast
 
 import sqlalchemy as sa
 from typing_extensions import TypedDict
@@ -194,13 +194,14 @@ def _result(
             "problem": problem,
             "warnings": [],
         }
+    of_code = cast("list[WarningDocument]", marker.get("code_warnings", []))  # which plates alone have
     return {
         "index": index,
         "status": status,
         "id": marker["id"],
         "version": marker["version"],
         "problem": None,
-        "warnings": [*marker.get("position_warnings", []), *marker.get("code_warnings", [])],
+        "warnings": [*marker.get("position_warnings", []), *of_code],
     }
 
 
