@@ -97,7 +97,7 @@ class LineStyle(StrEnum):
     DASHED = "dashed"
 
 
-class Mounting(StrEnum):
+class MagnetMounting(StrEnum):
     """How magnets are fixed: in drilled holes, or in shells that are glued onto the road (METRO section 8.2)."""
 
     HOLE = "hole"
@@ -116,8 +116,8 @@ class Installation:
     """
 
     mounting: Annotated[
-        Mounting, Field(description="`hole`: drilled; `surface`: in shells that are glued onto the road.")
-    ] = Mounting.HOLE
+        MagnetMounting, Field(description="`hole`: drilled; `surface`: in shells that are glued onto the road.")
+    ] = MagnetMounting.HOLE
     hole_diameter_mm: Annotated[
         Number | None,
         Field(ge=22.0, le=200.0, description="A bare METRO magnet of 15 x 15 x 9.5 mm needs at least 22 mm."),
@@ -134,7 +134,7 @@ class Installation:
     ] = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mounting", Mounting(self.mounting))
+        object.__setattr__(self, "mounting", MagnetMounting(self.mounting))
         other = ("hole_diameter_mm", "hole_depth_mm") if self.on_surface else ("shell_height_mm",)
         for name in other:
             if getattr(self, name) is not None:
@@ -148,7 +148,7 @@ class Installation:
     @property
     def on_surface(self) -> bool:
         """Whether nothing is drilled."""
-        return self.mounting is Mounting.SURFACE
+        return self.mounting is MagnetMounting.SURFACE
 
     @property
     def depth_m(self) -> float:

@@ -9,7 +9,7 @@ from typing import cast
 from app.families.magnet.layouts import MAX_MAGNETS, layout_of, sheet_of, site_of
 from app.families.magnet.magnets import MAGNET
 from app.families.surveys import Commitment, MarkerRules
-from app.markers.magnet import Installation, Mounting
+from app.markers.magnet import Installation, MagnetMounting
 from app.markers.magnet_design import MagnetSpec
 from app.planning.placement import place_plan
 from app.planning.rules import PlanRules
@@ -46,7 +46,7 @@ def test_planned_magnets_are_registered_as_they_are_fixed() -> None:
     )
     for row in MAGNET.planned_rows(commitment, made.markers):
         layout = layout_of("a line", row.columns["spec"])
-        assert layout.installation == Installation(Mounting.SURFACE, shell_height_mm=12)
+        assert layout.installation == Installation(MagnetMounting.SURFACE, shell_height_mm=12)
 
 
 def test_a_layout_of_an_earlier_release_is_read() -> None:

@@ -9,7 +9,7 @@ from pyproj import Geod
 
 from app.encoders.magnet import place_line, place_tag
 from app.errors import InvalidParameter
-from app.markers.magnet import HALF_HEIGHT_M, InformationTag, Installation, LineStyle, Mounting, Orientation
+from app.markers.magnet import HALF_HEIGHT_M, InformationTag, Installation, LineStyle, MagnetMounting, Orientation
 from app.markers.reading import Check
 from app.planning.magnet_checks import (
     ADHESIVE,
@@ -229,7 +229,7 @@ def test_a_line_costs_less_than_the_cheapest_paint() -> None:
 
 
 def test_magnets_on_the_surface_are_billed_with_shells_and_adhesive() -> None:
-    layout = place_tag(STRAIGHT, TAG, 50.0, name="tag", installation=Installation(mounting=Mounting.SURFACE))
+    layout = place_tag(STRAIGHT, TAG, 50.0, name="tag", installation=Installation(mounting=MagnetMounting.SURFACE))
     bill = bill_of_materials(layout)
     assert bill.total_usd == 3.0  # METRO section 8.1: 1 USD each, of it 0.25 for the shell
     assert [(row.cost.item, row.quantity, row.high_usd) for row in bill.materials] == [

@@ -2550,10 +2550,6 @@ export interface components {
             corridor_m: number;
             geometry: components["schemas"]["GeoLineIn"];
         };
-        /** @enum {string} */
-        app__markers__fiducial__Mounting: "upright" | "lying";
-        /** @enum {string} */
-        app__markers__magnet__Mounting: "hole" | "surface";
         ApprovalIn: {
             /** @default null */
             note?: string | null;
@@ -3866,7 +3862,7 @@ export interface components {
         };
         FiducialGeometry: {
             image: components["schemas"]["SignImage"] | null;
-            mounting: components["schemas"]["app__markers__fiducial__Mounting"];
+            mounting: components["schemas"]["Mounting"];
             quiet_mm: number;
             side_mm: number;
         };
@@ -3874,7 +3870,7 @@ export interface components {
             /** @default null */
             image?: components["schemas"]["SignImage"] | null;
             /** @default upright */
-            mounting?: components["schemas"]["app__markers__fiducial__Mounting"];
+            mounting?: components["schemas"]["Mounting"];
             /** @default null */
             quiet_mm?: number | null;
             side_mm: number;
@@ -4284,14 +4280,14 @@ export interface components {
             /** @default null */
             hole_diameter_mm?: number | null;
             /** @default hole */
-            mounting?: components["schemas"]["app__markers__magnet__Mounting"];
+            mounting?: components["schemas"]["MagnetMounting"];
             /** @default null */
             shell_height_mm?: number | null;
         };
         "Installation-Output": {
             hole_depth_mm: number | null;
             hole_diameter_mm: number | null;
-            mounting: components["schemas"]["app__markers__magnet__Mounting"];
+            mounting: components["schemas"]["MagnetMounting"];
             shell_height_mm: number | null;
         };
         Intrinsics: {
@@ -4707,6 +4703,8 @@ export interface components {
             /** @default null */
             tag?: components["schemas"]["TagIn"] | null;
         };
+        /** @enum {string} */
+        MagnetMounting: "hole" | "surface";
         MagnetReading: {
             along_std_m: number | null;
             clearance_cm: number;
@@ -4868,6 +4866,8 @@ export interface components {
             permissions: string[];
             scope: components["schemas"]["Scope"];
         };
+        /** @enum {string} */
+        Mounting: "upright" | "lying";
         MultiLineStringIn: {
             coordinates: number[][][];
             /**
