@@ -61,7 +61,7 @@ class PromisingColours:
     weakest_tint: float = 0.3
     # share of the variance that is explained [1], or margin of the second weakest marker [standard deviations], with
     # which the weakest may be missing
-    clear_explained: float = 0.85
+    clear_explained: float = 0.93
     clear_margin: float = 8.0
     cast: tuple[float, float] = (0.74, 1.35)  # blue and red of the units over their green
 

@@ -66,7 +66,8 @@ class FitLimits:
     # [log odds] of a candidate that gets a second geometry where the first explains nothing
     min_second_log_odds: float = -3.0
     # [1] by which a coarse fit may explain less than the best fit under another geometry, and still be finished
-    coarse_loss: float = 0.08
+    coarse_loss: float = 0.04
+    max_candidates: int = 6  # of all signals: a cluttered frame has more look-alikes than there is time for
     same_marker: float = 0.03  # [plate] distance of two candidates' markers up to which one fit serves both
     # [plate, px] distance of the fitted markers from the detected ones, the sum of both
     max_centroid_shift: tuple[float, float] = (0.15, 1.5)
@@ -226,8 +227,10 @@ class FrameReader:
         Another signal shows the same units, so none is searched either once a plate was seen clearly.
         """
         found: list[PlateInFrame] = []
+        left = LIMITS.max_candidates
         for signal, candidates in find_candidates(half_planes(self._image), self._geometries):
-            for candidate in candidates:
+            for candidate in candidates[:left]:
+                left -= 1
                 centre_px = candidate.quad.centroids_px.mean(axis=0)
                 if not any(plate.reading.code and plate.covers(centre_px) for plate in found):
                     plate = self._read_candidate(signal, candidate)
