@@ -54,7 +54,7 @@ from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
-VERSION = "matched-7"
+VERSION = "matched-8"
 """Kept with every decode; to be raised when findings change."""
 FIRST_VARIANCE = 2.0
 """Variance of the matched filters' noise that is assumed at first. [uT2] Source: a chip's noise of 1.5 uT."""

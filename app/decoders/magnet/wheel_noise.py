@@ -64,10 +64,6 @@ SMOOTH_M, MIN_STEP_M = 4.0, 0.001  # [m] of the moving mean that is taken off a 
 # What is taken out.
 FADE_AFTER_M, FADE_M = 3.0, 8.0  # [m] since a wheel was found noisy, from which on and over which it grows to all
 HALF_GAIN = 0.1  # strength of the noise over the residual's variance at which half of it is taken out
-MAX_LOUDNESS, LOUDNESS_M, LOUDNESS = 4.0, 0.3, 12.0
-"""[1, m, 1] largest strength of a wheel's noise at a sensor over that at the reference beside the wheel: at most the
-first, and the third times the sixth power of the second over the distance across the vehicle. 300 wheels of 2 to 7
-random dipoles have up to 3.7 at 0 to 0.2 m, 0.82 at 0.32 m, 0.21 at 0.48 m and 0.06 at 0.64 m."""
 MAX_RISE, MAX_RISE_NEAR = 0.45, 0.9
 """Largest strength of a wheel's noise at a sensor over the sum at the two beside it, as it falls away; the same near
 the wheel. 1,000 such wheels have up to 0.42 and 1.09; 99 % have up to 0.77 near the wheel."""
@@ -138,7 +134,6 @@ class _Channels(NamedTuple):
 class _Limits(NamedTuple):
     """The most noise that a wheel can have at each sensor."""
 
-    loudness: Floats  # (S,) strength over the loudest reference's
     rise: Floats  # (S,) strength over the sum of those at the sensors beside
     beside: Ints  # (S, 2) these sensors, -1 where a wheel may be as loud
 
@@ -246,19 +241,18 @@ def _nearness(positions_m: Floats, references: npt.NDArray[np.intp]) -> Floats:
 def _wheel_limits(positions_m: Floats, references: npt.NDArray[np.intp]) -> _Limits:
     """How a wheel's noise falls away from its reference across the vehicle."""
     sensors = len(positions_m)
-    loudness, rise = np.full(sensors, MAX_LOUDNESS), np.full(sensors, MAX_LOUDNESS)
+    rise = np.full(sensors, MAX_RISE_NEAR)
     beside = np.full((sensors, 2), -1, np.int64)
     if not len(references):
-        return _Limits(loudness, rise, beside)
+        return _Limits(rise, beside)
     across = np.abs(positions_m[:, None, 1] - positions_m[references, 1]).min(axis=1)
-    loudness = np.minimum(MAX_LOUDNESS, LOUDNESS * (LOUDNESS_M / np.hypot(across, LOUDNESS_M)) ** 6)
     rise = np.where(across >= FAR_M, MAX_RISE, MAX_RISE_NEAR)
     y = np.where(np.isin(np.arange(sensors), references), np.nan, positions_m[:, 1])  # of array sensors
     for j in np.flatnonzero(across >= NEAR_WHEEL_M):
         low, high = np.flatnonzero(y <= y[j] - APART_M), np.flatnonzero(y >= y[j] + APART_M)
         if low.size and high.size:
             beside[j] = low[np.argmax(y[low])], high[np.argmin(y[high])]
-    return _Limits(loudness, rise, beside)
+    return _Limits(rise, beside)
 
 
 @kernel
@@ -286,10 +280,9 @@ def _cancel(
             _follow_turn(w, rolled_m, progress.driven_m, x[i], turns, channels)
         locked_m = turns.locked_m.max()
         if locked_m > 0:
-            loudest = _loudest(turns, channels)
-            _set_gate(step, _strangeness(loudest, channels, limits), progress)
+            _set_gate(step, _strangeness(channels, limits), progress)
             fade = progress.gate * min(max((locked_m - FADE_AFTER_M) / FADE_M, 0.0), 1.0)
-            outliers = _subtract_noise(x[i], step, fade, loudest, channels)
+            outliers = _subtract_noise(x[i], step, fade, channels)
             if locked_m > FOLLOW_M:
                 _steer(step, turns, channels)
             known = locked_m > START_M or progress.errors_known
@@ -383,15 +376,6 @@ def _set_turns(s: float, turns: _Turns) -> None:
 
 
 @routine
-def _loudest(turns: _Turns, channels: _Channels) -> float:
-    """Strength of the noise at the reference that has most. [uT2]"""
-    loudest = 0.0
-    for w in range(turns.references.size):
-        loudest = max(loudest, _strength(turns.references[w], channels))
-    return loudest
-
-
-@routine
 def _strength(j: int, channels: _Channels) -> float:
     """Strength of the noise at a sensor. [uT2]"""
     total: float = channels.strength[j, 0] + channels.strength[j, 1] + channels.strength[j, 2]
@@ -399,7 +383,7 @@ def _strength(j: int, channels: _Channels) -> float:
 
 
 @routine
-def _strangeness(loudest: float, channels: _Channels, limits: _Limits) -> float:
+def _strangeness(channels: _Channels, limits: _Limits) -> float:
     """Strength of the noise at a sensor over the most that a wheel can have there, at the sensor with the highest."""
     highest = 0.0
     for j in range(channels.strength.shape[0]):
@@ -408,7 +392,6 @@ def _strangeness(loudest: float, channels: _Channels, limits: _Limits) -> float:
         if low < 0:
             continue
         most = limits.rise[j] * (_strength(low, channels) + _strength(high, channels))
-        most = min(most, limits.loudness[j] * loudest)
         least = MIN_STRANGE * (error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
         highest = max(highest, _strength(j, channels) / max(most, least))
     return highest
@@ -429,12 +412,11 @@ def _set_gate(step: float, strangeness: float, progress: _Progress) -> None:
 
 
 @routine
-def _subtract_noise(x: Floats, step: float, fade: float, loudest: float, channels: _Channels) -> int:
+def _subtract_noise(x: Floats, step: float, fade: float, channels: _Channels) -> int:
     """Take the predicted noise out of a block (S, 3), less where it is weak; returns the channels that are far off."""
     share = min(step / STRENGTH_M, 1.0)
     outliers = 0
     for j in range(x.shape[0]):
-        wheel = fade if _strength(j, channels) < MAX_LOUDNESS * loudest else 0.0
         for axis in range(3):
             predicted = 0.0
             for k in range(channels.regressors.size):
@@ -444,7 +426,7 @@ def _subtract_noise(x: Floats, step: float, fade: float, loudest: float, channel
             outliers += abs(residual) > CLIP * channels.error[j, axis]
             channels.strength[j, axis] += share * (predicted * predicted - channels.strength[j, axis])
             ratio = channels.strength[j, axis] / (channels.error[j, axis] ** 2 + 1e-6)
-            x[j, axis] -= wheel * predicted * ratio / (ratio + HALF_GAIN)
+            x[j, axis] -= fade * predicted * ratio / (ratio + HALF_GAIN)
     return outliers
 
 
