@@ -34,7 +34,7 @@ Complex = npt.NDArray[np.complex128]
 
 WINDOW_M = 3.2
 """Length of road of a spectrum. [m] Over seven heights of METRO's clearance; a Hann window halves it."""
-WAVES = 2 * np.pi * np.arange(2, 15) / WINDOW_M
+WAVES = 2 * np.pi * np.array([2, 3, 4, 5, 6, 8, 10, 12, 14]) / WINDOW_M
 """Wave numbers along the road. [rad/m] Waves of 1.6 m to 23 cm: longer ones come from cars beside the lane as well."""
 PERIOD_M = 6.0
 """Period of the plane waves across the road. [m] Bar and sources beside it, so that they do not meet themselves."""
@@ -47,7 +47,7 @@ UNEVEN, STAMP_S = 0.06, 0.0005
 time at which its axis is converted. [1, s]"""
 OTHER_SOURCES = 0.03
 """Share of windows whose field does not come from below alone: each channel is then independent of all others."""
-DEGREES_OF_FREEDOM = 0.5
+DEGREES_OF_FREEDOM = 0.65
 """Share of the log likelihood that counts: neighbouring wave numbers of a Hann window share their data."""
 MAX_WINDOWS, QUIET_WINDOWS, MIN_WINDOWS = 60, 40, 4
 """Windows with most energy that are compared, windows by which the noise is estimated, fewest that show anything."""
@@ -55,16 +55,15 @@ QUIET_SHARE = 0.6
 """Share of the windows for the noise, those with least energy, in which noise that sensors share is looked for."""
 MIN_SAMPLES = 24
 """Samples of a window."""
-SURE = 25.0
+SURE = 40.0
 """Log likelihood by which another mounting must be better; with `MIN_SUPPORT` windows that gain at least 1 each."""
 MIN_SUPPORT = 3
-BESIDE = 3
-"""`STRENGTHS` that the road can have at sensors that are not of the array: references high above the road."""
-DEAD_LEVEL, DEAD_ENERGY = 2.0, 1.3
-"""Noise of a dead sensor over that of the others, and its energy in windows over its noise, at most."""
+DEAD_LEVEL, DEAD_ENERGY, SEEN_ENERGY = 2.0, 1.3, 4.0
+"""Noise of a dead sensor over that of the others, its energy in windows over its noise, at most, and that of its
+neighbours, at least."""
 SUSPECT = 15.0
 """Log likelihood, each window's bounded, from which on a change is tried and must gain."""
-MIN_STRUCTURED = 0.9
+MIN_STRUCTURED = 0.97
 """Share of windows whose field comes from below, as declared, below which other mountings are tried."""
 TRIED, STARTS = 4, 2
 """Changes of sensors that are evaluated in each round, by either of two orders; other orders or axes from which the
@@ -97,14 +96,13 @@ class Mounting:
 
     channels: npt.NDArray[np.intp]  # shape (S,): channel of each sensor
     axes: Floats  # shape (S, 3, 3): signed permutation from a channel to the axes of its sensor
-    gains: Floats  # shape (S,): of the channel
-    usable: Bools  # shape (S,)
+    gains: Floats  # shape (S,): of the channel, 0 where it shows nothing
     rotation: Floats  # shape (3, 3): of the bar against the declared one
 
     @classmethod
     def declared(cls, sensors: int) -> Mounting:
         """That of the declaration."""
-        return cls(np.arange(sensors), np.tile(np.eye(3), (sensors, 1, 1)), np.ones(sensors), np.ones(sensors, bool), np.eye(3))
+        return cls(np.arange(sensors), np.tile(np.eye(3), (sensors, 1, 1)), np.ones(sensors), np.eye(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,6 +217,7 @@ class MountingModel:
     def __init__(self, spectra: Spectra, bar: MagnetometerBar, heights: Sequence[int] = range(len(HEIGHTS_M))) -> None:
         self.spectra, self.bar, self.heights = spectra, bar, tuple(heights)
         self.positions_m = bar.positions_m - bar.positions_m[bar.array].mean(axis=0)
+        self._in_array = _is_array(bar)
         waves = np.arange(0.5, 60.0) * 2 * np.pi / PERIOD_M
         self._across = waves[waves < 40.0]
         self._level = math.sqrt(float(np.median(spectra.noise[:, bar.array])))
@@ -226,19 +225,16 @@ class MountingModel:
     def evaluate(self, mounting: Mounting) -> Likelihood:
         """Log likelihood of each window."""
         data, places = self._oriented(mounting, self.spectra.field, self.spectra.crab_rad)
-        noise = self._noise(mounting)
-        array = self.bar.array[mounting.usable[self.bar.array]]
-        others = np.setdiff1d(np.arange(self.bar.sensor_count), array)
         windows = len(data)
         shape = (len(self.heights), len(STRENGTHS), windows)
         below, apart = np.zeros(shape), np.zeros(shape)
         lost = 0.0
-        for f, (white, logarithm) in enumerate(self._whitening(mounting, array, noise)):
-            lost += logarithm
-            whitened = data[:, f, array].reshape(windows, -1) @ white.T
+        for f, white in enumerate(self._whitening(mounting)):
+            lost -= 2 * float(np.linalg.slogdet(white)[1])
+            whitened = data[:, f].reshape(windows, -1) @ white.T
             squared = np.abs(whitened) ** 2
             for h, index in enumerate(self.heights):
-                covariance = self._covariance(WAVES[f], HEIGHTS_M[index], places[array], mounting.gains[array], white)
+                covariance = self._covariance(WAVES[f], HEIGHTS_M[index], places, mounting.gains, white)
                 values, vectors = np.linalg.eigh(covariance)
                 projected = np.abs(whitened @ vectors.conj()) ** 2
                 for out, energies, parts in (
@@ -248,31 +244,31 @@ class MountingModel:
                     out[h] -= np.log(variance).sum(axis=1)[:, None] + (1 / variance) @ parts.T
         flat = DEGREES_OF_FREEDOM * below.reshape(-1, windows)
         structured = np.logaddexp.reduce(flat, axis=0) + math.log(1 - OTHER_SOURCES)
-        unstructured = np.logaddexp.reduce(DEGREES_OF_FREEDOM * apart.reshape(-1, windows), axis=0) + math.log(OTHER_SOURCES)
-        # densities of data, not of data over noise, so that mountings with other channels in the array compare
-        total = np.logaddexp(structured, unstructured) - DEGREES_OF_FREEDOM * lost
-        total += self._alone(data[:, :, others], noise[:, others], ~mounting.usable[others])
+        unstructured = np.logaddexp.reduce(DEGREES_OF_FREEDOM * apart.reshape(-1, windows), axis=0) + math.log(
+            OTHER_SOURCES
+        )
         best = np.argmax(flat, axis=0)
+        # densities of data, not of data over noise, so that rotations of the bar compare
+        total = np.logaddexp(structured, unstructured) - DEGREES_OF_FREEDOM * lost
         return Likelihood(total, structured > unstructured, best // len(STRENGTHS))
 
-    def _whitening(self, mounting: Mounting, array: npt.NDArray[np.intp], noise: Floats) -> list[tuple[Complex, float]]:
-        """Matrices that make the noise of the array's channels white, and log determinants of its covariance.
+    def _whitening(self, mounting: Mounting) -> list[Complex]:
+        """Matrices that make the noise of all channels white, one for each wave number.
 
         The noise is that of each channel, and what several share: that of a wheel. It stands out of the quiet windows'
         covariance by more than chance does (Marchenko and Pastur's edge).
         """
+        noise = self._noise(mounting)
         quiet, _places = self._oriented(mounting, self.spectra.quiet, self.spectra.quiet_crab_rad)
         out = []
         for f in range(len(WAVES)):
-            variance = noise[f, array].ravel()
-            scale = 1 / np.sqrt(variance)
-            seen = quiet[:, f, array].reshape(len(quiet), -1) * scale
+            scale = 1 / np.sqrt(noise[f].ravel())
+            seen = quiet[:, f].reshape(len(quiet), -1) * scale
             chance = (1 + math.sqrt(seen.shape[1] / max(len(seen), 1))) ** 2
             values, vectors = np.linalg.eigh(seen.T @ seen.conj() / max(len(seen), 1))
             shared = values > chance
             values, vectors = values[shared], vectors[:, shared]
-            white = np.eye(len(scale)) + (vectors * (1 / np.sqrt(values) - 1)) @ vectors.conj().T
-            out.append((white * scale, float(np.log(variance).sum() + np.log(values).sum())))
+            out.append((np.eye(len(scale)) + (vectors * (1 / np.sqrt(values) - 1)) @ vectors.conj().T) * scale)
         return out
 
     def _oriented(self, mounting: Mounting, field: Complex, crab_rad: Floats) -> tuple[Complex, Floats]:
@@ -281,17 +277,20 @@ class MountingModel:
         The x axis is multiplied by i, which makes the covariance of a field from below real.
         """
         data = np.einsum("sab,wfsb->wfsa", mounting.axes, field[:, :, mounting.channels])
+        turns = np.where(self._in_array[:, None, None], mounting.rotation, np.eye(3))
+        places = np.einsum("sab,sb->sa", turns, self.positions_m)
         out = np.empty_like(data)
         for w, crab in enumerate(crab_rad):
-            turn = rotation_about("z", -crab) @ mounting.rotation
-            ahead = (self.positions_m @ turn.T)[:, 0]
-            out[w] = (data[w] @ turn.T) * np.exp(-1j * np.outer(WAVES, ahead))[:, :, None]
+            turn = rotation_about("z", -crab)
+            ahead = places @ turn[0]
+            out[w] = np.einsum("sab,fsb->fsa", turn @ turns, data[w]) * np.exp(-1j * np.outer(WAVES, ahead))[:, :, None]
         out[..., 0] *= 1j
-        return out, self.positions_m @ mounting.rotation.T
+        return out, places
 
     def _noise(self, mounting: Mounting) -> Floats:
         moved = np.einsum("sab,fsb->fsa", np.abs(mounting.axes), self.spectra.noise[:, mounting.channels])
-        return np.asarray(np.einsum("ab,fsb->fsa", mounting.rotation**2, moved))
+        turned = np.einsum("ab,fsb->fsa", mounting.rotation**2, moved)
+        return np.asarray(np.where(self._in_array[:, None], turned, moved))
 
     def _covariance(self, wave: float, height_m: float, places_m: Floats, gains: Floats, white: Complex) -> Complex:
         """Covariance of whitened channels from sources of strength 1 at a depth, shape (3 A, 3 A)."""
@@ -300,7 +299,11 @@ class MountingModel:
         cosine, sine = np.cos(np.outer(places_m[:, 1], across)), np.sin(np.outer(places_m[:, 1], across))
         decay = gains[:, None] * np.exp(-length * (height_m + places_m[:, 2, None]))
         x, y, z = wave * decay, across * decay, length * decay
-        rows = [np.hstack([x * cosine, x * sine]), np.hstack([y * sine, -y * cosine]), np.hstack([z * cosine, z * sine])]
+        rows = [
+            np.hstack([x * cosine, x * sine]),
+            np.hstack([y * sine, -y * cosine]),
+            np.hstack([z * cosine, z * sine]),
+        ]
         factor = np.stack(rows, axis=1).reshape(3 * len(places_m), -1)
         factor *= math.exp(WAVES[0] * height_m) / 10 * self._level
         own = UNEVEN**2 + (wave * STAMP_S * self.spectra.speed_m_s) ** 2
@@ -308,50 +311,35 @@ class MountingModel:
         covariance[np.diag_indices(len(covariance))] *= 1 + own
         return np.asarray(white @ covariance @ white.conj().T)
 
-    def _alone(self, data: Complex, noise: Floats, dead: Bools) -> Floats:
-        """Log likelihood (W,) of sensors (W, F, N, 3) beside the array, which see little of the road; dead ones nothing."""
-        if not data.shape[2]:
-            return np.zeros(len(data))
-        squared = (np.abs(data) ** 2 / noise).sum(axis=(1, 3))  # W, N
-        count = 3 * len(WAVES)
-        strengths = 1 + STRENGTHS[:BESIDE, None, None]
-        each = -count * np.log(strengths) - squared / strengths
-        own = np.where(dead, -squared, np.logaddexp.reduce(each, axis=0))
-        return DEGREES_OF_FREEDOM * (own.sum(axis=1) - np.log(noise).sum())
-
-
     def sensor_changes(self, mounting: Mounting) -> list[Mounting]:
         """Mountings in which one sensor's axes are inverted, or two sensors exchanged, that are worth to be evaluated.
 
         The noise is that of the mounting before, so their likelihoods are near the true ones only.
         """
-        spectra = self.spectra
+        spectra, array = self.spectra, self.bar.array
         data, places = self._oriented(mounting, spectra.field, spectra.crab_rad)
-        array = self.bar.array[mounting.usable[self.bar.array]]
-        whitening = self._whitening(mounting, array, self._noise(mounting))
-        windows, sensors = len(data), len(array)
+        whitening = self._whitening(mounting)
+        windows = len(data)
         signs = [np.diag(s) for s in itertools.product((1.0, -1.0), repeat=3)][1:]
         inverted = [replace(mounting, axes=np.einsum("ab,sbc->sac", turn, mounting.axes)) for turn in signs]
         flipped = [self._oriented(one, spectra.field, spectra.crab_rad)[0] for one in inverted]
-        changes = [(k, k, number) for k in range(sensors) for number in range(len(signs))]
-        changes += [(k, other, -1) for k in range(sensors) for other in range(k)]
+        changes = [(k, k, number) for k in array for number in range(len(signs))]
+        changes += [(k, other, -1) for k, other in itertools.combinations(array, 2)]
         totals = np.zeros((len(changes) + 1, len(self.heights), len(STRENGTHS), windows))
         for f, h in itertools.product(range(len(WAVES)), range(len(self.heights))):
-            white = whitening[f][0]
-            height_m = HEIGHTS_M[self.heights[h]]
-            covariance = self._covariance(WAVES[f], height_m, places[array], mounting.gains[array], white)
+            white = whitening[f]
+            covariance = self._covariance(WAVES[f], HEIGHTS_M[self.heights[h]], places, mounting.gains, white)
             values, vectors = np.linalg.eigh(covariance)
             variance = 1 + STRENGTHS[:, None] * np.maximum(values, 0.0)
             lost = np.log(variance).sum(axis=1)[:, None]
-            own = data[:, f, array]  # W, A, 3
+            own = data[:, f]  # W, S, 3
             together = white.T @ vectors.conj()
             base = own.reshape(windows, -1) @ together
-            parts = together.reshape(sensors, 3, -1)
-            turned = [full[:, f, array] for full in flipped]
+            parts = together.reshape(self.bar.sensor_count, 3, -1)
             totals[-1, h] -= lost + (1 / variance) @ (np.abs(base) ** 2).T
             for number, (k, other, sign) in enumerate(changes):
                 if sign >= 0:
-                    projected = base + (turned[sign][:, k] - own[:, k]) @ parts[k]
+                    projected = base + (flipped[sign][:, f, k] - own[:, k]) @ parts[k]
                 else:
                     projected = base + (own[:, other] - own[:, k]) @ (parts[k] - parts[other])
                 totals[number, h] -= lost + (1 / variance) @ (np.abs(projected) ** 2).T
@@ -366,10 +354,9 @@ class MountingModel:
             k, other, sign = changes[number]
             axes, channels = mounting.axes.copy(), mounting.channels.copy()
             if sign >= 0:
-                axes[array[k]] = signs[sign] @ axes[array[k]]
+                axes[k] = signs[sign] @ axes[k]
             else:
-                first, second = array[[k, other]]
-                channels[[first, second]], axes[[first, second]] = channels[[second, first]], axes[[second, first]]
+                channels[[k, other]], axes[[k, other]] = channels[[other, k]], axes[[other, k]]
             found.append(replace(mounting, axes=axes, channels=channels))
         return found
 
@@ -402,24 +389,26 @@ class MountingCheck:
     mounting: Mounting | None  # that explains the recording; None where it cannot be decided
     faults: tuple[MountingFault, ...] = ()  # none where the bar is as declared
 
-    def corrected(self, trace: MagnetTrace, bar: MagnetometerBar) -> tuple[MagnetTrace, MagnetometerBar]:
-        """The recording as the declared sensors would have made it, and where they really are."""
+    def corrected(self, trace: MagnetTrace, bar: MagnetometerBar) -> MagnetTrace:
+        """The recording as the declared bar would have made it."""
         one = self.mounting
         if one is None or not self.faults:
-            return trace, bar
+            return trace
         turns = np.where(_is_array(bar)[:, None, None], one.rotation @ one.axes, one.axes)
-        turns = turns / one.gains[:, None, None]
+        dead = one.gains == 0
+        turns = turns / np.where(dead, 1.0, one.gains)[:, None, None]
         field = np.einsum("sab,tsb->tsa", turns.astype(np.float32), trace.field_ut[:, one.channels])
-        field[:, ~one.usable] = np.nan
         ahead = ((bar.positions_m - bar.positions_m[bar.array].mean(axis=0)) @ one.rotation.T)[:, 0]
-        if np.abs(ahead).max() > 0.0 and not np.array_equal(one.rotation, np.eye(3)):
+        if not np.array_equal(one.rotation, np.eye(3)):
+            field = _repaired(field)
             odometer = _odometer(trace)
             odometer += 1e-9 * np.arange(len(odometer))  # also rises where the vehicle stands
             for j in bar.array:  # as if it were abreast of the others
                 at = odometer - ahead[j] + self._declared_ahead(bar)[j]
                 for axis in range(3):
                     field[:, j, axis] = np.interp(at, odometer, field[:, j, axis])
-        return replace(trace, field_ut=field), bar
+        field[:, dead] = np.nan
+        return replace(trace, field_ut=field)
 
     @staticmethod
     def _declared_ahead(bar: MagnetometerBar) -> Floats:
@@ -438,11 +427,10 @@ def check_mounting(trace: MagnetTrace, bar: MagnetometerBar, events_m: Sequence[
     spectra = measure_spectra(trace, bar, events_m)
     if spectra is None:
         return MountingCheck(declared)
-    everywhere = MountingModel(spectra, bar)
-    best, model = _search(everywhere, declared)
+    best, model = _search(spectra, bar, declared, trace)
     common = _common_axes(best, bar)
     if not np.array_equal(common, np.eye(3)):
-        turning = turning_field(*MountingCheck(best, (_ANY,)).corrected(trace, bar))
+        turning = turning_field(MountingCheck(best, (_ANY,)).corrected(trace, bar), bar)
         signs = _signs_by_earth(turning)
         if signs is None:
             return MountingCheck(None, (_undecided(common),))
@@ -457,34 +445,35 @@ def _at_heights(spectra: Spectra, bar: MagnetometerBar, likelihood: Likelihood) 
     return MountingModel(spectra, bar, sorted(np.argsort(-counts)[:2].tolist()))
 
 
-def _search(everywhere: MountingModel, declared: Mounting) -> tuple[Mounting, MountingModel]:
+def _search(
+    spectra: Spectra, bar: MagnetometerBar, declared: Mounting, trace: MagnetTrace
+) -> tuple[Mounting, MountingModel]:
     """The mounting with the highest likelihood: order and axes of all sensors first, then single sensors."""
-    spectra, bar = everywhere.spectra, everywhere.bar
+    everywhere = MountingModel(spectra, bar)
     before = everywhere.evaluate(declared)
     near = _at_heights(spectra, bar, before)
-    at_first = near.evaluate(declared)
-    found = [(declared, near, *_with_other_sensors(near, declared, at_first))]
-    candidates = [(one, near, at_first) for one in _ordered(bar)]
-    if before.structured.mean() < MIN_STRUCTURED:
-        candidates += [(one, everywhere, before) for one in _with_other_axes(bar)]
+    turned = _turned(near, declared, trace)
+    best, _likelihood = _with_other_sensors(near, turned, near.evaluate(turned))
+    if before.structured.mean() >= MIN_STRUCTURED:
+        return best, near
+    found = [(everywhere.evaluate(best), best)]
     better = []
-    for candidate, model, start in candidates:
-        likelihood = model.evaluate(candidate)
-        if _is_better(likelihood, start):
-            better.append((likelihood.total - start.total, candidate, likelihood))
-    for _gain, candidate, likelihood in sorted(better, key=lambda one: -one[0])[:STARTS]:
-        model = near if len(likelihood.windows) and not len(better) else _at_heights(spectra, bar, everywhere.evaluate(candidate))
-        found.append((candidate, model, *_with_other_sensors(model, candidate, model.evaluate(candidate))))
-    _start, model, best, _likelihood = max(found, key=lambda one: everywhere.evaluate(one[2]).total if len(found) > 1 else 0)
-    return best, model
+    for candidate in (*_ordered(bar), *_with_other_axes(bar)):
+        likelihood = everywhere.evaluate(candidate)
+        if _is_better(likelihood, before):
+            better.append((likelihood, candidate))
+    for likelihood, candidate in sorted(better, key=lambda one: -one[0].total)[:STARTS]:
+        model = _at_heights(spectra, bar, likelihood)
+        best, _likelihood = _with_other_sensors(model, candidate, model.evaluate(candidate))
+        found.append((everywhere.evaluate(best), best))
+    likelihood, best = max(found, key=lambda one: one[0].total)
+    return best, _at_heights(spectra, bar, likelihood)
 
 
 def _with_other_sensors(model: MountingModel, best: Mounting, current: Likelihood) -> tuple[Mounting, Likelihood]:
     """A mounting in which single sensors are changed as long as the likelihood asks for it."""
     for sensor in _dead_sensors(model.spectra, model.bar):
-        usable = best.usable.copy()
-        usable[np.flatnonzero(best.channels == sensor)] = False
-        candidate = replace(best, usable=usable)
+        candidate = replace(best, gains=np.where(best.channels == sensor, 0.0, best.gains))
         if _is_better(found := model.evaluate(candidate), current):
             best, current = candidate, found
     for _ in range(model.bar.sensor_count):
@@ -553,11 +542,20 @@ def _is_array(bar: MagnetometerBar) -> Bools:
 
 
 def _dead_sensors(spectra: Spectra, bar: MagnetometerBar) -> list[int]:
-    """Channels of the array that show no more where something is passed than elsewhere, and are no louder than others."""
+    """Channels of the array that show no more where something is passed than elsewhere, though their neighbours do.
+
+    They are no louder than others. Only neighbours count: what lies in the middle of the lane, the ends do not see.
+    """
     level = np.median(spectra.noise, axis=(0, 2))
     energy = (np.abs(spectra.field) ** 2 / spectra.noise).mean(axis=(0, 1, 3))
     quiet = level < DEAD_LEVEL * np.median(level[bar.array])
-    return [int(j) for j in bar.array if quiet[j] and energy[j] < DEAD_ENERGY]
+    by_place = bar.array[np.argsort(bar.positions_m[bar.array, 1])]
+    found = []
+    for k, sensor in enumerate(by_place):
+        beside = [by_place[n] for n in (k - 1, k + 1) if 0 <= n < len(by_place)]
+        if quiet[sensor] and energy[sensor] < DEAD_ENERGY and min(energy[beside]) > SEEN_ENERGY:
+            found.append(int(sensor))
+    return found
 
 
 def _turned(model: MountingModel, best: Mounting, trace: MagnetTrace) -> Mounting:
@@ -567,22 +565,32 @@ def _turned(model: MountingModel, best: Mounting, trace: MagnetTrace) -> Mountin
     """
     if trace.heading_deg is None:
         return best
-    angle_deg, step_deg, current = 0.0, YAW_STEP_DEG, model.evaluate(best)
-    start = current
+    first_deg = angle_deg = _yaw_deg(best)
+    straight = model.evaluate(_at_yaw(best, 0.0))
+    current = model.evaluate(best) if first_deg else straight
+    step_deg = YAW_STEP_DEG
     for _ in range(3):
-        low, high = (
-            model.evaluate(replace(best, rotation=rotation_about("z", math.radians(angle_deg + side * step_deg))))
-            for side in (-1, 1)
-        )
+        low, high = (model.evaluate(_at_yaw(best, angle_deg + side * step_deg)) for side in (-1, 1))
         bend = low.total + high.total - 2 * current.total
         move = (low.total - high.total) / (2 * bend) if bend < 0 else math.copysign(1.0, high.total - low.total)
         if abs(angle_deg + move * step_deg) < 1.0 and angle_deg == 0.0:
             return best
         angle_deg = float(np.clip(angle_deg + step_deg * np.clip(move, -2, 2), -MAX_TURN_DEG, MAX_TURN_DEG))
-        current = model.evaluate(replace(best, rotation=rotation_about("z", math.radians(angle_deg))))
+        current = model.evaluate(_at_yaw(best, angle_deg))
         step_deg /= 2
-    turned = replace(best, rotation=rotation_about("z", math.radians(angle_deg)))
-    return turned if abs(angle_deg) > MIN_TURN_DEG and _is_better(current, start) else best
+    ahead = np.abs(model.spectra.crab_rad) < math.radians(MIN_TURN_DEG)  # a wrong speed makes bends look sharper
+    is_turned = _is_better(
+        replace(current, windows=current.windows[ahead]), replace(straight, windows=straight.windows[ahead])
+    )
+    return _at_yaw(best, angle_deg if abs(angle_deg) > MIN_TURN_DEG and is_turned else 0.0)
+
+
+def _yaw_deg(mounting: Mounting) -> float:
+    return math.degrees(math.atan2(mounting.rotation[1, 0], mounting.rotation[0, 0]))
+
+
+def _at_yaw(mounting: Mounting, angle_deg: float) -> Mounting:
+    return replace(mounting, rotation=rotation_about("z", math.radians(angle_deg)))
 
 
 # === Which of the mountings that look alike from below it is.
@@ -635,7 +643,7 @@ def _with_signs(mounting: Mounting, signs: tuple[float, float], spectra: Spectra
     references = bar.references
     if len(references) == 2 and _are_exchanged(spectra, bar, mounting.channels[mirror]):
         mirror[references] = references[::-1]
-    moved = (values[mirror] for values in (mounting.channels, axes, mounting.gains, mounting.usable))
+    moved = (values[mirror] for values in (mounting.channels, axes, mounting.gains))
     turned = np.diag((1.0, -1.0, 1.0)) @ mounting.rotation @ np.diag((1.0, -1.0, 1.0))
     return Mounting(*moved, turned)
 
@@ -703,7 +711,10 @@ def _all_axes_text(axes: Floats, mirrored: bool) -> str:
 def _axes_text(axes: Floats) -> str:
     """What a signed permutation does to axes."""
     if np.count_nonzero(axes - np.diag(np.diag(axes))):
-        rows = [f"{'xyz'[k]} is {'-' if axes[k].sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(axes[k])))]}" for k in range(3)]
+        rows = [
+            f"{'xyz'[k]} is {'-' if axes[k].sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(axes[k])))]}"
+            for k in range(3)
+        ]
         return ", ".join(rows)
     inverted = [name for name, sign in zip("xyz", np.diag(axes), strict=True) if sign < 0]
     return f"{' and '.join(inverted)} {'is' if len(inverted) == 1 else 'are'} inverted"
@@ -729,14 +740,14 @@ def _describe(mounting: Mounting, bar: MagnetometerBar) -> Iterator[MountingFaul
                 yield MountingFault("bar.sensors", name, "connect or declare them in their order")
     for j in bar.array:
         number = int(channels[j]) + 1
-        if not mounting.usable[j]:
+        if mounting.gains[j] == 0:
             yield MountingFault("bar.sensors", f"sensor {number} shows no field", "replace it; it is left out")
         elif not np.array_equal(mounting.axes[j], common):
             what = _axes_text(mounting.axes[j] @ common.T)
             turned = np.linalg.det(mounting.axes[j] @ common.T) > 0
             name = f"sensor {number} is turned over ({what})" if turned else f"of sensor {number}, {what}"
             yield MountingFault("bar.sensors", name, "turn the sensor, or declare its rotation")
-    angle_deg = math.degrees(math.atan2(mounting.rotation[1, 0], mounting.rotation[0, 0]))
+    angle_deg = _yaw_deg(mounting)
     if abs(angle_deg) > MIN_TURN_DEG:
         side = "left" if angle_deg > 0 else "right"
         name = f"the bar is turned by {abs(angle_deg):.0f} degrees to the {side}"

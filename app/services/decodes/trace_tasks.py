@@ -87,9 +87,12 @@ def decode_recording(
         content = read_trace({name: stream}, declared, limits)
     loaded = time.perf_counter()
     trace, report = content.trace, content.report
-    findings, version = find_magnets(trace, declared, tags, formats)
-    if declared.method == "matched":
-        for mistake in find_mistakes(trace, declared.sensors, findings):
+    checked, version = find_magnets(trace, declared, tags, formats)
+    findings = checked.findings
+    for mistake in checked.faults:
+        report.warn(mistake.text)
+    if declared.method == "matched" and not checked.is_refused:
+        for mistake in find_mistakes(checked.trace, declared.sensors, findings):
             report.warn(mistake.text)
     report.load_ms, report.decode_ms = 1e3 * (loaded - began), 1e3 * (time.perf_counter() - loaded)
     speed = np.interp(trace.t_s, trace.speed_t_s, trace.speed_m_s)
