@@ -1,7 +1,7 @@
 """``python -m benchmarks.magnets [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: recall, lateral, tags, ratio, wheel, lines, false, speed, drawn, physics, bars, rails, all. The decoder does not know the
-clearance.
+Items: recall, lateral, tags, ratio, wheel, lines, false, speed, drawn, physics, bars, rails, all. The decoder does
+not know the clearance.
 """
 
 from __future__ import annotations

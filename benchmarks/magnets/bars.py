@@ -169,7 +169,9 @@ FAULTS = (
     Fault("y and z inverted", lambda t, _r: _with_signs(t, np.arange(14), (1, -1, -1)), "FRD"),
     Fault("one sensor dead", _dead, "sensor"),
     Fault("one sensor scaled by 1.5", _scaled, "times"),
-    Fault("bar mounted backwards", lambda t, _r: _with_signs(_ordered(t, _BACKWARDS), BAR.array, (-1, -1, 1)), "backwards"),
+    Fault(
+        "bar mounted backwards", lambda t, _r: _with_signs(_ordered(t, _BACKWARDS), BAR.array, (-1, -1, 1)), "backwards"
+    ),
 )  # fmt: skip
 
 

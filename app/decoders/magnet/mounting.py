@@ -43,8 +43,8 @@ HEIGHTS_M = np.array([0.11, 0.15, 0.20, 0.27, 0.36, 0.48])
 STRENGTHS = 4.0 ** np.arange(10)
 """Energies of a window's sources, over the noise."""
 UNEVEN, STAMP_S = 0.06, 0.0005
-"""Errors of a channel that the model allows: share of its field (gain 2 %, direction 1.5 degrees, bounce of the bar), and
-time at which its axis is converted. [1, s]"""
+"""Errors of a channel that the model allows: share of its field (gain 2 %, direction 1.5 degrees, bounce), and time at
+which its axis is converted. [1, s]"""
 OTHER_SOURCES = 0.03
 """Share of windows whose field does not come from below alone: each channel is then independent of all others."""
 DEGREES_OF_FREEDOM = 0.65
@@ -185,7 +185,7 @@ def _spectrum(s_m: Floats, field_ut: Floats) -> Complex:
     weighted = line * weight[:, None]
     flat = flat - line @ np.linalg.lstsq(weighted.T @ line, weighted.T @ flat, rcond=None)[0]
     waves: Complex = np.exp(-1j * np.outer(WAVES, s_m)) * weight
-    return (waves @ flat).reshape(len(WAVES), *field_ut.shape[1:])
+    return np.asarray((waves @ flat).reshape(len(WAVES), *field_ut.shape[1:]))
 
 
 # === The likelihood.
@@ -389,30 +389,21 @@ class MountingCheck:
     mounting: Mounting | None  # that explains the recording; None where it cannot be decided
     faults: tuple[MountingFault, ...] = ()  # none where the bar is as declared
 
-    def corrected(self, trace: MagnetTrace, bar: MagnetometerBar) -> MagnetTrace:
-        """The recording as the declared bar would have made it."""
-        one = self.mounting
-        if one is None or not self.faults:
-            return trace
-        turns = np.where(_is_array(bar)[:, None, None], one.rotation @ one.axes, one.axes)
-        dead = one.gains == 0
-        turns = turns / np.where(dead, 1.0, one.gains)[:, None, None]
-        field = np.einsum("sab,tsb->tsa", turns.astype(np.float32), trace.field_ut[:, one.channels])
-        ahead = ((bar.positions_m - bar.positions_m[bar.array].mean(axis=0)) @ one.rotation.T)[:, 0]
-        if not np.array_equal(one.rotation, np.eye(3)):
-            field = _repaired(field)
-            odometer = _odometer(trace)
-            odometer += 1e-9 * np.arange(len(odometer))  # also rises where the vehicle stands
-            for j in bar.array:  # as if it were abreast of the others
-                at = odometer - ahead[j] + self._declared_ahead(bar)[j]
-                for axis in range(3):
-                    field[:, j, axis] = np.interp(at, odometer, field[:, j, axis])
-        field[:, dead] = np.nan
-        return replace(trace, field_ut=field)
 
-    @staticmethod
-    def _declared_ahead(bar: MagnetometerBar) -> Floats:
-        return np.asarray(bar.positions_m[:, 0] - bar.positions_m[bar.array, 0].mean())
+def as_declared(mounting: Mounting, trace: MagnetTrace, bar: MagnetometerBar) -> MagnetTrace:
+    """The recording as the declared bar would have made it; NaN of dead sensors."""
+    dead = mounting.gains == 0
+    turns = np.where(_is_array(bar)[:, None, None], mounting.rotation @ mounting.axes, mounting.axes)
+    field = np.einsum("sab,tsb->tsa", turns.astype(np.float32), trace.field_ut[:, mounting.channels])
+    if not np.array_equal(mounting.rotation, np.eye(3)):
+        places = bar.positions_m - bar.positions_m[bar.array].mean(axis=0)
+        ahead = (places @ mounting.rotation.T - places)[:, 0]
+        field, odometer = _repaired(field), _odometer(trace)
+        odometer += 1e-9 * np.arange(len(odometer))  # also rises where the vehicle stands
+        for j, axis in itertools.product(bar.array, range(3)):  # as if it were where it was declared
+            field[:, j, axis] = np.interp(odometer - ahead[j], odometer, field[:, j, axis])
+    field[:, dead] = np.nan
+    return replace(trace, field_ut=field)
 
 
 def check_mounting(trace: MagnetTrace, bar: MagnetometerBar, events_m: Sequence[float]) -> MountingCheck:
@@ -430,7 +421,7 @@ def check_mounting(trace: MagnetTrace, bar: MagnetometerBar, events_m: Sequence[
     best, model = _search(spectra, bar, declared, trace)
     common = _common_axes(best, bar)
     if not np.array_equal(common, np.eye(3)):
-        turning = turning_field(MountingCheck(best, (_ANY,)).corrected(trace, bar), bar)
+        turning = turning_field(as_declared(best, trace, bar), bar)
         signs = _signs_by_earth(turning)
         if signs is None:
             return MountingCheck(None, (_undecided(common),))
@@ -643,9 +634,8 @@ def _with_signs(mounting: Mounting, signs: tuple[float, float], spectra: Spectra
     references = bar.references
     if len(references) == 2 and _are_exchanged(spectra, bar, mounting.channels[mirror]):
         mirror[references] = references[::-1]
-    moved = (values[mirror] for values in (mounting.channels, axes, mounting.gains))
     turned = np.diag((1.0, -1.0, 1.0)) @ mounting.rotation @ np.diag((1.0, -1.0, 1.0))
-    return Mounting(*moved, turned)
+    return Mounting(mounting.channels[mirror], axes[mirror], mounting.gains[mirror], turned)
 
 
 def _are_exchanged(spectra: Spectra, bar: MagnetometerBar, channels: npt.NDArray[np.intp]) -> bool:
@@ -752,6 +742,3 @@ def _describe(mounting: Mounting, bar: MagnetometerBar) -> Iterator[MountingFaul
         side = "left" if angle_deg > 0 else "right"
         name = f"the bar is turned by {abs(angle_deg):.0f} degrees to the {side}"
         yield MountingFault("bar.sensors", name, "mount it across the vehicle, or declare where its sensors are")
-
-
-_ANY = MountingFault("", "", "")

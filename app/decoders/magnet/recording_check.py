@@ -17,7 +17,7 @@ import numpy as np
 
 from app.decoders.magnet.decoder import decode_trace
 from app.decoders.magnet.identify import TagCandidates
-from app.decoders.magnet.mounting import MAX_PHASE_DEG, MIRRORED, check_mounting, turning_field
+from app.decoders.magnet.mounting import MAX_PHASE_DEG, MIRRORED, as_declared, check_mounting, turning_field
 from app.decoders.magnet.readings import (
     CheckedRecording,
     Finding,
@@ -83,7 +83,7 @@ def decode_checked(
     if check.mounting is None:
         refused = [_refused(one, faults[0]) for one in findings if isinstance(one, MagnetReading | NoiseFinding)]
         return CheckedRecording([*(_note(fault, trace, "") for fault in faults), *refused], faults, trace, True)
-    corrected = check.corrected(trace, bar)
+    corrected = as_declared(check.mounting, trace, bar)
     findings = decode_trace(corrected, bar, candidates=candidates)
     notes = [_note(fault, trace, "; corrected in this decode") for fault in faults]
     return CheckedRecording([*notes, *unreadable_stretches(findings), *findings], faults, corrected)

@@ -318,7 +318,7 @@ def _magnetised(values_am: Floats) -> Vector:
     return float(values_am[0]), float(values_am[1]), float(values_am[2])
 
 
-def _car(rng: np.random.Generator) -> list[Spheroid]:
+def _car_spheroids(rng: np.random.Generator) -> list[Spheroid]:
     """A hull, an engine in front or behind, and two axles."""
     front = float(rng.choice((-1, 1)))
     hull_am, engine_am = rng.normal(0, 20, 3), rng.normal(0, 300, 3)
@@ -332,7 +332,7 @@ def _car(rng: np.random.Generator) -> list[Spheroid]:
     ]
 
 
-def _cover(rng: np.random.Generator) -> list[Spheroid]:
+def _cover_spheroids(rng: np.random.Generator) -> list[Spheroid]:
     """Seven parallel bars that fill a disc of 60 cm, 70 kg."""
     common_am = rng.normal((0.0, 0.0, -900.0), 1200.0)
     return [
@@ -344,7 +344,7 @@ def _cover(rng: np.random.Generator) -> list[Spheroid]:
     ]  # fmt: skip
 
 
-def _joint(rng: np.random.Generator) -> list[Spheroid]:
+def _joint_spheroids(rng: np.random.Generator) -> list[Spheroid]:
     """Two edges across the road, each of seven bars of a metre."""
     return [
         Spheroid((along, left, -0.03), _ACROSS, 0.5, 0.03, _magnetised(rng.normal(0, (1000, 2000, 1000))))
@@ -353,7 +353,7 @@ def _joint(rng: np.random.Generator) -> list[Spheroid]:
     ]
 
 
-def _rebar(rng: np.random.Generator) -> list[Spheroid]:
+def _rebar_spheroids(rng: np.random.Generator) -> list[Spheroid]:
     """Twelve metres of bars across, 16 mm thick, one every 20 cm, 6 cm deep."""
     return [
         Spheroid(
@@ -364,7 +364,7 @@ def _rebar(rng: np.random.Generator) -> list[Spheroid]:
     ]  # fmt: skip
 
 
-def _plate(rng: np.random.Generator) -> list[Spheroid]:
+def _plate_spheroids(rng: np.random.Generator) -> list[Spheroid]:
     """The rim of a steel plate of 2 by 1.5 m."""
     common_am = rng.normal(0, 3000, 3)
     edges = [((0.0, side * 0.75, 0.0), _ALONG, 1.0) for side in (-1, 1)]
@@ -375,13 +375,13 @@ def _plate(rng: np.random.Generator) -> list[Spheroid]:
     ]
 
 
-def _bolt(rng: np.random.Generator) -> list[Spheroid]:
+def _bolt_spheroids(rng: np.random.Generator) -> list[Spheroid]:
     """A nut, a bolt, a piece of wire, 2 to 8 cm long."""
     half_length, half_width = rng.uniform(0.01, 0.04), rng.uniform(0.004, 0.01)
     return [_loose(rng, 0.01, float(half_length), float(half_width), strongest=4.7)]
 
 
-def _scrap(rng: np.random.Generator) -> list[Spheroid]:
+def _scrap_spheroids(rng: np.random.Generator) -> list[Spheroid]:
     """A piece of exhaust or a tool, 15 to 50 cm long."""
     half_length, half_width = rng.uniform(0.075, 0.25), rng.uniform(0.008, 0.02)
     return [_loose(rng, 0.02, float(half_length), float(half_width), strongest=4.5)]
@@ -398,6 +398,6 @@ def _loose(
 
 
 SHAPES: dict[str, Callable[[np.random.Generator], list[Spheroid]]] = {
-    "car": _car, "manhole cover": _cover, "bridge joint": _joint, "rebar": _rebar, "steel plate": _plate,
-    "bolt": _bolt, "scrap": _scrap,
+    "car": _car_spheroids, "manhole cover": _cover_spheroids, "bridge joint": _joint_spheroids, "rebar": _rebar_spheroids, "steel plate": _plate_spheroids,
+    "bolt": _bolt_spheroids, "scrap": _scrap_spheroids,
 }  # fmt: skip
