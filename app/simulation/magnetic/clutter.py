@@ -398,7 +398,7 @@ def _loose(
 
 
 SHAPES: dict[str, Callable[[np.random.Generator], list[Spheroid]]] = {
-    "car": _car_spheroids, "manhole cover": _cover_spheroids, "bridge joint": _joint_spheroids, "rebar": _rebar_spheroids,
-    "steel plate": _plate_spheroids,
+    "car": _car_spheroids, "manhole cover": _cover_spheroids, "bridge joint": _joint_spheroids,
+    "rebar": _rebar_spheroids, "steel plate": _plate_spheroids,
     "bolt": _bolt_spheroids, "scrap": _scrap_spheroids,
 }  # fmt: skip
