@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -112,7 +113,7 @@ class Fault:
 
     name: str
     spoil: Callable[[MagnetTrace, np.random.Generator], MagnetTrace]
-    named: str  # part of the mistake's name that counts as naming it
+    named: str  # the mistake's whole name, with {sensors} and {axes} of what is spoilt
     rotation: Floats | None = None  # of the bar, if it is turned
 
 
@@ -154,32 +155,51 @@ _BACKWARDS = [*_RIGHT, 6, *_LEFT, 13]
 
 def _turned(degrees: float) -> Fault:
     rotation = yaw_matrix(degrees)
-    return Fault(f"bar turned by {degrees:g} degrees", lambda t, _r: _rotated(t, rotation), "turned by", rotation)
+    return Fault(f"bar turned by {degrees:g} degrees", lambda t, _r: _rotated(t, rotation), "", rotation)
 
 
 FAULTS = (
-    Fault("one sensor upside down", lambda t, r: _any_sign(t, r, 2), "sensor"),
-    Fault("one axis of one sensor inverted", lambda t, r: _any_sign(t, r, 1), "sensor"),
+    Fault("one sensor upside down", lambda t, r: _any_sign(t, r, 2),
+        "sensor {sensors} is turned over ({axes} are inverted)"),
+    Fault("one axis of one sensor inverted", lambda t, r: _any_sign(t, r, 1),
+        "of sensor {sensors}, {axes} is inverted"),
     _turned(3), _turned(8), _turned(15),
-    Fault("sensor order reversed", lambda t, _r: _ordered(t, list(range(14))[::-1]), "order"),
-    Fault("left and right exchanged", lambda t, _r: _ordered(t, _BACKWARDS), "left"),
-    Fault("halves mirrored", lambda t, _r: _ordered(t, [*_LEFT[::-1], 6, *_RIGHT[::-1], 13]), "other ends"),
-    Fault("neighbouring cables swapped", _swap, "exchanged"),
-    Fault("x and z inverted", lambda t, _r: _with_signs(t, np.arange(14), (-1, 1, -1)), "inverted"),
-    Fault("y and z inverted", lambda t, _r: _with_signs(t, np.arange(14), (1, -1, -1)), "FRD"),
-    Fault("one sensor dead", _dead, "sensor"),
-    Fault("one sensor scaled by 1.5", _scaled, "times"),
+    Fault("sensor order reversed", lambda t, _r: _ordered(t, list(range(14))[::-1]),
+        "the order of all sensors is reversed"),
+    Fault("left and right exchanged", lambda t, _r: _ordered(t, _BACKWARDS), "left and right of the bar are exchanged"),
+    Fault("halves mirrored", lambda t, _r: _ordered(t, [*_LEFT[::-1], 6, *_RIGHT[::-1], 13]),
+        "both halves are numbered from their other ends"),
+    Fault("neighbouring cables swapped", _swap, "sensors {sensors} are exchanged"),
+    Fault("x and z inverted", lambda t, _r: _with_signs(t, np.arange(14), (-1, 1, -1)), "x and z are inverted"),
+    Fault("y and z inverted", lambda t, _r: _with_signs(t, np.arange(14), (1, -1, -1)),
+        "the axes are FRD where FLU was declared or the other way round"),
+    Fault("one sensor dead", _dead, "sensor {sensors} shows no field"),
+    Fault("one sensor scaled by 1.5", _scaled, "the gain of sensor {sensors} is 1.5"),
     Fault(
-        "bar mounted backwards", lambda t, _r: _with_signs(_ordered(t, _BACKWARDS), BAR.array, (-1, -1, 1)), "backwards"
+        "bar mounted backwards", lambda t, _r: _with_signs(_ordered(t, _BACKWARDS), BAR.array, (-1, -1, 1)),
+        "the bar is mounted backwards"
     ),
 )  # fmt: skip
 
 
-def draw_faulty_drive(fault: Fault, rng: np.random.Generator, *, turning: bool) -> SimulatedDrive:
-    """A drive that a faulty bar recorded; the true magnets are as on a healthy one."""
+def draw_faulty_drive(fault: Fault, rng: np.random.Generator, *, turning: bool) -> tuple[SimulatedDrive, str]:
+    """A drive that a faulty bar recorded, with the fault's name; the true magnets are as on a healthy one."""
     bar = BAR if fault.rotation is None else turned_bar(fault.rotation)
     drive = draw_road_drive(rng, turning=turning, bar=bar)
-    return replace(drive, trace=fault.spoil(drive.trace, rng))
+    spoilt = fault.spoil(drive.trace, rng)
+    changed = (spoilt.field_ut != drive.trace.field_ut).any(axis=0)
+    sensors = " and ".join(str(j + 1) for j in np.flatnonzero(changed.any(axis=1)))
+    axes = " and ".join("xyz"[k] for k in np.flatnonzero(changed.any(axis=0)))
+    return replace(drive, trace=spoilt), fault.named.format(sensors=sensors, axes=axes)
+
+
+def _is_name(reason: str, fault: Fault, name: str) -> bool:
+    """Whether a reason names this fault: its sensors and axes, or the angle within two degrees; or one of a choice."""
+    if fault.rotation is None:
+        return name in reason.split("; or ")
+    found = re.fullmatch(r"the bar is turned by (\d+) degrees to the (left|right)", reason)
+    true_deg = math.degrees(math.atan2(fault.rotation[1, 0], fault.rotation[0, 0]))
+    return found is not None and abs(float(found[1]) * (1 if found[2] == "left" else -1) - true_deg) <= 2
 
 
 # === Tables.
@@ -198,7 +218,7 @@ class FaultTally:
     other: int = 0  # faults that are named and are none
     worst: list[float] = field(default_factory=lambda: [1.0, 1.0])
 
-    def add(self, drive: SimulatedDrive, fault: Fault | None) -> None:
+    def add(self, drive: SimulatedDrive, fault: Fault | None, name: str = "") -> None:
         """Decode a drive without and with the check of its bar."""
         candidates = TagCandidates(formats=[FORMAT])
         checked = decode_checked(drive.trace, BAR, candidates=candidates)
@@ -211,7 +231,7 @@ class FaultTally:
             self.read[k] += tally.found
             self.wrong[k] += of_sure.wrong + of_sure.extra
             self.worst[k] = min(self.worst[k], tally.recall)
-        right = [one for one in checked.faults if fault is not None and fault.named in one.reason]
+        right = [one for one in checked.faults if fault is not None and _is_name(one.reason, fault, name)]
         self.named += bool(right)
         self.refused += checked.is_refused
         self.other += len(checked.faults) - len(right)
@@ -225,7 +245,8 @@ def run_bars(seed: int, short: bool) -> tuple[str, Sequence[str], list[Sequence[
             tally = FaultTally()
             for k in range(2 if short else 6):
                 rng = np.random.default_rng([seed, 81, FAULTS.index(fault), turning, k])
-                tally.add(draw_faulty_drive(fault, rng, turning=turning), fault)
+                drive, named = draw_faulty_drive(fault, rng, turning=turning)
+                tally.add(drive, fault, named)
             rows.append(_row(f"{fault.name}, {'turning' if turning else 'straight'}", tally))
     for name, options in HEALTHY.items():
         tally = FaultTally()

@@ -63,6 +63,8 @@ DEAD_LEVEL, DEAD_ENERGY, SEEN_ENERGY = 2.0, 1.3, 4.0
 neighbours, at least."""
 SUSPECT = 15.0
 """Log likelihood, each window's bounded, from which on a change is tried and must gain."""
+MAX_CHANGED, MIN_EXPLAINED = 2, 0.8
+"""Sensors that are corrected one by one, at most, and share of windows that a correction explains, at least."""
 MIN_STRUCTURED = 0.97
 """Share of windows whose field comes from below, as declared, below which other mountings are tried."""
 TRIED, STARTS = 4, 2
@@ -80,9 +82,8 @@ MIRRORED = 2.0
 """[1] amplitude of the field that turns one way over that of the one that turns the other way."""
 MAX_OF_WINDOW = 10.0
 """Log likelihood that one window adds at most to what asks for a closer look at a sensor."""
-MIN_TURN_DEG = 2.5
-"""Smallest rotation of the bar that is corrected. [deg]"""
-MAX_TURN_DEG = 25.0
+MIN_TURN_DEG, MAX_TURN_DEG = 2.5, 25.0
+"""Smallest and largest rotation of the bar that is corrected. [deg]"""
 SPIKE_UT = 20.0
 """Deviation of one sensor from the samples before and after that is a fault, if fewer than three sensors have it."""
 
@@ -152,8 +153,7 @@ def measure_spectra(trace: MagnetTrace, bar: MagnetometerBar, events_m: Sequence
     by_energy = np.argsort(energy)
     strongest, weakest = by_energy[compared[by_energy]][::-1], by_energy[for_noise[by_energy]]
     strongest, weakest = strongest[:MAX_WINDOWS], weakest[: round(QUIET_SHARE * len(weakest))]
-    speed_m_s = float(np.median(speeds))
-    return Spectra(field[strongest], turns[strongest], noise, field[weakest], turns[weakest], speed_m_s)
+    return Spectra(field[strongest], turns[strongest], noise, field[weakest], turns[weakest], float(np.median(speeds)))
 
 
 def _odometer(trace: MagnetTrace) -> Floats:
@@ -244,9 +244,8 @@ class MountingModel:
                     out[h] -= np.log(variance).sum(axis=1)[:, None] + (1 / variance) @ parts.T
         flat = DEGREES_OF_FREEDOM * below.reshape(-1, windows)
         structured = np.logaddexp.reduce(flat, axis=0) + math.log(1 - OTHER_SOURCES)
-        unstructured = np.logaddexp.reduce(DEGREES_OF_FREEDOM * apart.reshape(-1, windows), axis=0) + math.log(
-            OTHER_SOURCES
-        )
+        flat_apart = DEGREES_OF_FREEDOM * apart.reshape(-1, windows)
+        unstructured = np.logaddexp.reduce(flat_apart, axis=0) + math.log(OTHER_SOURCES)
         best = np.argmax(flat, axis=0)
         # densities of data, not of data over noise, so that rotations of the bar compare
         total = np.logaddexp(structured, unstructured) - DEGREES_OF_FREEDOM * lost
@@ -299,11 +298,7 @@ class MountingModel:
         cosine, sine = np.cos(np.outer(places_m[:, 1], across)), np.sin(np.outer(places_m[:, 1], across))
         decay = gains[:, None] * np.exp(-length * (height_m + places_m[:, 2, None]))
         x, y, z = wave * decay, across * decay, length * decay
-        rows = [
-            np.hstack([x * cosine, x * sine]),
-            np.hstack([y * sine, -y * cosine]),
-            np.hstack([z * cosine, z * sine]),
-        ]
+        rows = [np.hstack(one) for one in ((x * cosine, x * sine), (y * sine, -y * cosine), (z * cosine, z * sine))]
         factor = np.stack(rows, axis=1).reshape(3 * len(places_m), -1)
         factor *= math.exp(WAVES[0] * height_m) / 10 * self._level
         own = UNEVEN**2 + (wave * STAMP_S * self.spectra.speed_m_s) ** 2
@@ -420,14 +415,25 @@ def check_mounting(trace: MagnetTrace, bar: MagnetometerBar, events_m: Sequence[
         return MountingCheck(declared)
     best, model = _search(spectra, bar, declared, trace)
     common = _common_axes(best, bar)
+    signs = _signs_by_earth(turning_field(as_declared(best, trace, bar), bar))
     if not np.array_equal(common, np.eye(3)):
-        turning = turning_field(as_declared(best, trace, bar), bar)
-        signs = _signs_by_earth(turning)
         if signs is None:
             return MountingCheck(None, (_undecided(common),))
-        best = _with_signs(best, signs, spectra, bar)
+        best, signs = _with_signs(best, signs, spectra, bar), None
     best = _turned(model, best, trace)
-    return MountingCheck(best, tuple(_describe(best, bar)))
+    faults = tuple(_describe(best, bar))
+    is_likely = _changed_sensors(best, bar) <= MAX_CHANGED and signs in (None, (1.0, 1.0))
+    if faults and not (is_likely and model.evaluate(best).structured.mean() >= MIN_EXPLAINED):
+        name = f"the bar is not as declared, and no single cause explains it ({'; '.join(one.name for one in faults)})"
+        return MountingCheck(None, (MountingFault("bar.sensors", name, "check the order and axes of all sensors"),))
+    return MountingCheck(best, faults)
+
+
+def _changed_sensors(mounting: Mounting, bar: MagnetometerBar) -> int:
+    """Sensors of the array that differ from the likeliest fault of all."""
+    turned = (mounting.axes != _common_axes(mounting, bar)).any(axis=(1, 2))
+    orders = (np.arange(bar.sensor_count), _mirrored(bar), *_orders(bar).values())
+    return min(int(((mounting.channels != order) | turned)[bar.array].sum()) for order in orders)
 
 
 def _at_heights(spectra: Spectra, bar: MagnetometerBar, likelihood: Likelihood) -> MountingModel:
@@ -445,8 +451,8 @@ def _search(
     near = _at_heights(spectra, bar, before)
     turned = _turned(near, declared, trace)
     best, _likelihood = _with_other_sensors(near, turned, near.evaluate(turned))
-    if before.structured.mean() >= MIN_STRUCTURED:
-        return best, near
+    if before.structured.mean() >= MIN_STRUCTURED and best is turned and not _yaw_deg(best):
+        return best, near  # what changes sensors may be a fault of them all, also where most windows are quiet
     found = [(everywhere.evaluate(best), best)]
     better = []
     for candidate in (*_ordered(bar), *_with_other_axes(bar)):
