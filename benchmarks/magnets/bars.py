@@ -145,7 +145,7 @@ def _dead(trace: MagnetTrace, rng: np.random.Generator) -> MagnetTrace:
 def _any_sign(trace: MagnetTrace, rng: np.random.Generator, inverted: int) -> MagnetTrace:
     signs = np.ones(3)
     signs[rng.choice(3, inverted, replace=False)] = -1
-    return _with_signs(trace, _one(rng), tuple(signs))
+    return _with_signs(trace, _one(rng), (float(signs[0]), float(signs[1]), float(signs[2])))
 
 
 _LEFT, _RIGHT = [0, 1, 2, 3, 4, 5], [7, 8, 9, 10, 11, 12]
@@ -295,7 +295,7 @@ def run_rails(seed: int, short: bool) -> tuple[str, Sequence[str], list[Sequence
         stretches = [f for f in checked.findings if isinstance(f, NoiseFinding) and f.kind is NoiseKind.UNREADABLE]
         named += any(times[0] - 1 < f.t_s < times[1] for f in stretches)
         beyond += sum(not times[0] - 1 < f.t_s < times[1] for f in stretches)
-    rows = [
+    rows: list[Sequence[object]] = [
         (name, tally.true, f"{tally.recall:.3f}", tally.wrong + tally.extra)
         for name, tally in zip(("between rails", "before and behind"), found, strict=True)
     ]

@@ -82,7 +82,7 @@ MIRRORED = 2.0
 """[1] amplitude of the field that turns one way over that of the one that turns the other way."""
 MAX_OF_WINDOW = 10.0
 """Log likelihood that one window adds at most to what asks for a closer look at a sensor."""
-MIN_TURN_DEG, MAX_TURN_DEG = 2.5, 25.0
+MIN_TURN_DEG, MAX_TURN_DEG = 5.0, 25.0
 """Smallest and largest rotation of the bar that is corrected. [deg]"""
 SPIKE_UT = 20.0
 """Deviation of one sensor from the samples before and after that is a fault, if fewer than three sensors have it."""
@@ -575,7 +575,7 @@ def _turned(model: MountingModel, best: Mounting, trace: MagnetTrace) -> Mountin
         angle_deg = float(np.clip(angle_deg + step_deg * np.clip(move, -2, 2), -MAX_TURN_DEG, MAX_TURN_DEG))
         current = model.evaluate(_at_yaw(best, angle_deg))
         step_deg /= 2
-    ahead = np.abs(model.spectra.crab_rad) < math.radians(MIN_TURN_DEG)  # a wrong speed makes bends look sharper
+    ahead = np.abs(model.spectra.crab_rad) < math.radians(MIN_TURN_DEG / 2)  # a wrong speed makes bends look sharper
     is_turned = _is_better(
         replace(current, windows=current.windows[ahead]), replace(straight, windows=straight.windows[ahead])
     )
