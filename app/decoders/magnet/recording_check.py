@@ -1,33 +1,25 @@
-"""Whether bar and units of a recording can be what was declared, and the mistake that is likely if not.
+"""Whether units and axes of a recording can be what was declared, and the mistake that is likely if not.
 
-The mounting of the bar is compared first (`mounting`), and corrected where the recording decides it. Two invariants
-remain. The horizontal field of the earth turns with the heading of the vehicle, whatever offsets the sensors have: its
-size shows the unit, its sense and its phase the axes. And magnets are dipoles: a speed or a field in a wrong unit
-distorts them, so that none is read, or all of them look much too weak or too strong at a wrong clearance; in the right
-unit they are read, and look like the magnets that are sold.
+Two invariants are used. The horizontal field of the earth turns with the heading of the vehicle, whatever offsets the
+sensors have: its size shows the unit, its sense and its phase the axes. And magnets are dipoles: a speed or a field
+in a wrong unit distorts them, so that none is read, or all of them look much too weak or too strong at a wrong
+clearance; in the right unit they are read, and look like the magnets that are sold.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.decoders.magnet.decoder import decode_trace
 from app.decoders.magnet.identify import TagCandidates
-from app.decoders.magnet.mounting import MAX_PHASE_DEG, MIRRORED, as_declared, check_mounting, turning_field
-from app.decoders.magnet.readings import (
-    CheckedRecording,
-    Finding,
-    LikelyMistake,
-    MagnetReading,
-    NoiseFinding,
-    NoiseKind,
-)
+from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding, NoiseKind
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+from app.values import Floats
 
 SURE_CONFIDENCE = 0.99
 """[probability] of a magnet that counts."""
@@ -43,8 +35,8 @@ much as one that makes them too weak."""
 MAX_REJECTED = 0.5
 """[1] Dipoles that are no magnets, over the sure magnets, from which on the declaration is checked."""
 PIECE_S = 30.0
-"""[s] of the piece of a recording, where the field changes most, that is decoded again: nine decodes take one to
-two seconds of one core."""
+"""[s] of the piece of a recording, where the field changes most, that is decoded again: thirteen decodes take one to
+three seconds of one core."""
 CHANGE_BLOCK_S = 1.0
 """[s] of the blocks by whose changes that piece is found."""
 SPEED_FACTORS = {
@@ -55,79 +47,43 @@ SPEED_FACTORS = {
 """Speeds, over those that a wrong unit gives. Source: definitions of the units."""
 FIELD_FACTORS = {"ten times as large": 10.0, "a tenth as large": 0.1, "100 times as large": 100.0}
 """Fields, over those that a wrong unit gives. Source: mG, uT, 10 nT and mT are powers of ten apart."""
+AXES = {
+    "FRD where FLU was declared or the other way round (or a stream that runs backwards)": ((0, 1, 2), (1, -1, -1)),
+    "that exchange x and y": ((1, 0, 2), (1, 1, 1)),
+    "that exchange x and z": ((2, 1, 0), (1, 1, 1)),
+    "that exchange y and z": ((0, 2, 1), (1, 1, 1)),
+}
+"""Axis that each vehicle axis is taken from, and its sign."""
 EARTH_HORIZONTAL_UT = (8.0, 60.0)
 """[uT] amplitude with which the earth's horizontal field turns. Source: it is 10 to 42 uT below 65 degrees of latitude
 (World Magnetic Model); a third of margin for the iron of a vehicle."""
+MIN_TURN_DEG, RATE_HZ = 60.0, 5.0
+"""[deg, Hz] change of heading from which on the earth's field is compared, and rate at which."""
+MAX_RESIDUAL = 0.5
+"""[amplitude] root mean square of what the turning field leaves, above which nothing is concluded."""
+MAX_PHASE_DEG = 60.0
+"""[deg] between the heading and the field's direction. Source: magnetic declination is below 30 degrees in inhabited
+regions (World Magnetic Model), and iron adds some."""
+MIRRORED = 2.0
+"""[1] amplitude of the field that turns the other way over that of the one that turns as it must."""
 
-STRETCH_M, IRON_APART_M, IRON_SPACING_M = 15.0, 4.0, 2.0
-"""[m] length of a stretch that cannot be read, largest distance between rejected dipoles in it, and largest mean
-distance. A mesh of 12 m is no such stretch. Source: `python -m benchmarks.magnets bars`."""
+
 CONTRADICTED_M = 0.06
 """[m] between the declared clearance and that of the magnets. Source: a load lowers a car by up to 5 cm."""
 
 
-def decode_checked(
-    trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCandidates | None = None
-) -> CheckedRecording:
-    """Findings of a whole trace, decoded again where its bar is not mounted as declared.
+@dataclass(frozen=True, slots=True)
+class LikelyMistake:
+    """A declaration that the recording contradicts."""
 
-    Where the recording shows that the bar is not as declared, but not how it is, no magnet is reported.
-    """
-    findings = decode_trace(trace, bar, candidates=candidates)
-    events_m = sorted(one.odometer_m for one in findings if isinstance(one, MagnetReading | NoiseFinding))
-    check = check_mounting(trace, bar, events_m)
-    stretches = unreadable_stretches(findings)
-    if not check.faults:
-        return CheckedRecording([*stretches, *findings], (), trace)
-    faults = tuple(LikelyMistake(fault.field, fault.name, fault.cure) for fault in check.faults)
-    if check.mounting is None:
-        refused = [_refused(one, faults[0]) for one in findings if isinstance(one, MagnetReading | NoiseFinding)]
-        return CheckedRecording([*(_note(fault, trace, "") for fault in faults), *refused], faults, trace, True)
-    corrected = as_declared(check.mounting, trace, bar)
-    findings = decode_trace(corrected, bar, candidates=candidates)
-    notes = [_note(fault, trace, "; corrected in this decode") for fault in faults]
-    return CheckedRecording([*notes, *unreadable_stretches(findings), *findings], faults, corrected)
+    field: str  # of the declaration
+    reason: str  # what does not fit, with figures
+    cure: str  # what to declare
 
-
-def _note(fault: LikelyMistake, trace: MagnetTrace, suffix: str) -> NoiseFinding:
-    """A fault of the bar as a finding, at the beginning of the recording."""
-    return NoiseFinding(float(trace.t_s[0]), 0.0, 0.0, NoiseKind.SENSOR, fault.reason + suffix)
-
-
-def _refused(one: MagnetReading | NoiseFinding, fault: LikelyMistake) -> NoiseFinding:
-    """A magnet as the finding that its bar is not as declared."""
-    if isinstance(one, NoiseFinding):
-        return one
-    reason = f"not reported, as the bar is not as declared: {fault.reason}"
-    return NoiseFinding(one.t_s, one.odometer_m, one.lateral_cm, NoiseKind.SENSOR, reason)
-
-
-def unreadable_stretches(findings: Sequence[Finding]) -> list[NoiseFinding]:
-    """Stretches of road on which iron, such as the rails of a tram, is so dense that magnets are lost in it."""
-    single = [one for one in findings if isinstance(one, MagnetReading | NoiseFinding)]
-    iron = sorted(
-        (one for one in single if isinstance(one, NoiseFinding) and one.kind not in (NoiseKind.GAP, NoiseKind.SENSOR)),
-        key=lambda one: one.odometer_m,
-    )
-    if not iron:
-        return []
-    found = []
-    ends = [
-        k for k in range(len(iron)) if k + 1 == len(iron) or iron[k + 1].odometer_m - iron[k].odometer_m > IRON_APART_M
-    ]
-    for first, last in zip([0, *(k + 1 for k in ends[:-1])], ends, strict=True):
-        start, end = iron[first], iron[last]
-        length_m = end.odometer_m - start.odometer_m
-        count = last - first + 1
-        read = sum(isinstance(one, MagnetReading) and start.t_s <= one.t_s <= end.t_s for one in single)
-        if length_m >= STRETCH_M and count > length_m / IRON_SPACING_M and read < count / 2:
-            reason = (
-                f"iron hides magnets from {start.odometer_m:.0f} m to {end.odometer_m:.0f} m "
-                f"({start.t_s:.1f} s to {end.t_s:.1f} s): {count} dipoles that are no magnets, {read} magnets; "
-                "what is not read there may be there nevertheless"
-            )
-            found.append(NoiseFinding(start.t_s, start.odometer_m, 0.0, NoiseKind.UNREADABLE, reason))
-    return found
+    @property
+    def text(self) -> str:
+        """Reason and cure in one sentence."""
+        return f"{self.reason}: {self.cure}"
 
 
 def find_mistakes(
@@ -182,12 +138,26 @@ def compare_with_clearance(
 
 
 def compare_with_earth(trace: MagnetTrace, bar: MagnetometerBar) -> LikelyMistake | None:
-    """The mistake that the earth's horizontal field shows while the vehicle turns, if there is one."""
-    turning = turning_field(trace, bar)
-    if turning is None:
+    """The mistake that the earth's horizontal field shows while the vehicle turns, if there is one.
+
+    With x forward, y left and the heading h clockwise from north, x + iy of the earth's field is H exp(i (h - D)) and
+    constant offsets, where D is the declination. One more term, in exp(-ih), is left where an axis is mirrored.
+    """
+    if trace.heading_t_s is None or trace.heading_deg is None or not len(trace.heading_t_s):
         return None
-    along, against = turning
+    step = max(round(trace.rate_hz / RATE_HZ), 1)
+    field: Floats = np.nanmedian(trace.field_ut[::step][:, bar.array], axis=1).astype(float)
+    heading = np.interp(trace.t_s[::step], trace.heading_t_s, np.unwrap(np.radians(trace.heading_deg)))
+    known = np.isfinite(field).all(axis=1)
+    if known.sum() < 20 or np.ptp(heading[known]) < np.radians(MIN_TURN_DEG):
+        return None
+    turning, seen = np.exp(1j * heading[known]), field[known, 0] + 1j * field[known, 1]
+    shape = np.stack([turning, turning.conj(), np.ones_like(turning)], axis=1)
+    fitted = np.linalg.lstsq(shape, seen, rcond=None)[0]
+    along, against, _offset = fitted
     amplitude = max(abs(along), abs(against))
+    if float(np.sqrt(np.mean(np.abs(seen - shape @ fitted) ** 2))) > MAX_RESIDUAL * amplitude:
+        return None
     if abs(against) > MIRRORED * abs(along):
         return LikelyMistake(
             "axes",
@@ -218,7 +188,7 @@ def compare_with_earth(trace: MagnetTrace, bar: MagnetometerBar) -> LikelyMistak
 def compare_with_dipoles(
     trace: MagnetTrace, bar: MagnetometerBar, candidates: TagCandidates | None = None
 ) -> LikelyMistake | None:
-    """The unit with which a recording has magnets, where it has few or unlikely ones as it was declared.
+    """The unit or the axes with which a recording has magnets, where it has few or unlikely ones as it was declared.
 
     Magnets that are read in a wrong unit of the speed look too weak or too strong, all alike: then only a unit in which
     they are as strong as usual is reported.
@@ -254,6 +224,9 @@ def _alternatives(piece: MagnetTrace) -> Iterator[tuple[str, str, MagnetTrace]]:
         yield "speed_unit", f"speeds in {name}", replace(piece, speed_m_s=piece.speed_m_s * factor)
     for name, factor in FIELD_FACTORS.items():
         yield "unit", f"a field that is {name}", replace(piece, field_ut=piece.field_ut * np.float32(factor))
+    for name, (order, signs) in AXES.items():
+        turned = np.ascontiguousarray(piece.field_ut[..., order] * np.array(signs, np.float32))
+        yield "axes", f"axes {name}", replace(piece, field_ut=turned)
 
 
 def _sure(findings: Sequence[Finding]) -> list[MagnetReading]:

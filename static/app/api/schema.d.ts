@@ -4974,7 +4974,7 @@ export interface components {
             t_s: number;
         };
         /** @enum {string} */
-        NoiseKind: "ferrous-object" | "moment-unlike-a-magnet" | "not-on-the-road-surface" | "clearance-not-known" | "neither-upright-nor-forward" | "too-weak-to-be-sure" | "beside-the-bar" | "gap-in-the-trace" | "sensor-fault" | "stretch-not-readable";
+        NoiseKind: "ferrous-object" | "moment-unlike-a-magnet" | "not-on-the-road-surface" | "clearance-not-known" | "neither-upright-nor-forward" | "too-weak-to-be-sure" | "beside-the-bar" | "gap-in-the-trace" | "sensor-fault";
         NssdaDocument: {
             horizontal_95_m: number | null;
             is_tested: boolean;

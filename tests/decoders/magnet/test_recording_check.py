@@ -67,6 +67,17 @@ def test_a_wrong_unit_of_the_field_is_named(factor: float, named: str) -> None:
     assert by_earth.field == "unit"
 
 
+@pytest.mark.parametrize(
+    ("order", "signs", "named"),
+    [((0, 1, 2), (1, -1, -1), "FRD where FLU"), ((1, 0, 2), (1, 1, 1), "x and y"), ((0, 2, 1), (1, 1, 1), "y and z")],
+)
+def test_wrong_axes_are_named(order: tuple[int, ...], signs: tuple[int, ...], named: str) -> None:
+    mistake = compare_with_dipoles(with_axes(recorded(), order, signs), BAR)
+    assert mistake is not None
+    assert mistake.field == "axes"
+    assert named in mistake.text
+
+
 def test_the_earths_field_shows_mirrored_and_inverted_axes() -> None:
     trace = recorded(bends=BENDS)
     mirrored = compare_with_earth(with_axes(trace, (0, 1, 2), (1, -1, -1)), BAR)
