@@ -137,10 +137,10 @@ def test_the_likelihoods_are_those_of_normal_distributions(veil: float) -> None:
             paint = (units * np.square(own)) @ units.T
             covariance = 0.25 * (smooth * np.outer(mean, mean) + paint) + added
             expected = scipy.stats.multivariate_normal(0.5 * mean, covariance).logpdf(pixels.light)
-            assert found[unit, column] == pytest.approx(expected + constant, rel=1e-4, abs=0.01)
+            assert found[unit, column] == pytest.approx(expected + constant, rel=3e-4, abs=0.01)
     # a spot without opacity is no spot: the flipped unit, under the covariance of the unit as read
     residual = pixels.light - 0.5 * (seen + (1 - albedo) * units[:, 0])
     paint = (units * np.square((DARK_SPREAD, WHITE_SPREAD))) @ units.T
     covariance = 0.25 * (smooth * np.outer(seen, seen) + paint) + added
     expected = scipy.stats.multivariate_normal(np.zeros(count), covariance).logpdf(residual)
-    assert found[0, 4] == pytest.approx(expected + constant, rel=1e-4, abs=0.01)  # single precision
+    assert found[0, 4] == pytest.approx(expected + constant, rel=3e-4, abs=0.01)  # single precision
