@@ -104,7 +104,6 @@ class PlateSearch:
     camera: Camera | None = None
     # plates that the registry knows nearby
     codebook: tuple[PlateCode, ...] = ()  # plates that the registry knows nearby
-    # dimensions to look for; the decoder's own where there are none
     geometries: tuple[PlateGeometry, ...] = ()  # dimensions to look for; the decoder's own where there are none
     is_paper: bool = False  # by the paper's own algorithm
 

@@ -275,7 +275,7 @@ _SeenAhead = list[tuple[int, float, PlateReading]]
 
 
 def _list_seen(frames: Sequence[DriveFrame]) -> list[_SeenAhead]:
-    """Sure readings of each plate with its distance ahead [m], in frames in a row."""
+    """Readings with digits of each plate, with its distance ahead [m], in frames in a row."""
     found: list[_SeenAhead] = []
     latest: dict[PlateCode, _SeenAhead] = {}
     for place, frame in enumerate(frames):

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from app.decoders.plate import Array
-from app.decoders.plate.confirm import Expected
+from app.decoders.plate.confirm import Expected, with_unseen_damage
 from app.decoders.plate.detect_blobs import difference_signal, half_planes
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
 from app.decoders.plate.fit import fit_plate, project
@@ -111,6 +111,7 @@ class ExpectedPlate:
 
     code: PlateCode
     geometry: PlateGeometry
+    is_registered: bool  # a registered plate has its code
     # shape (K, 4, 2): [px] its corners under each hypothesis of how far the vehicle has come
     places_px: Array
     number: int  # of the other frame
@@ -126,7 +127,9 @@ def expect_plate(expected: Expected, camera: Camera) -> ExpectedPlate | None:
     high = (camera.width_px - 1, camera.height_px - 1)
     seen = [one for one in placed if one is not None and (one >= 0).all() and (one <= high).all()]
     seen = [one for one in seen if np.ptp(one[:, 1]) >= MIN_EXPECTED_UNIT_PX * geometry.n]
-    return ExpectedPlate(code, geometry, np.array(seen), expected.number) if seen else None
+    if not seen:
+        return None
+    return ExpectedPlate(code, geometry, reading.is_registered, np.array(seen), expected.number)
 
 
 def find_expected(image: Array, expected: ExpectedPlate, camera: Camera | None = None) -> PlateReading | None:
@@ -163,7 +166,11 @@ def find_expected(image: Array, expected: ExpectedPlate, camera: Camera | None =
     reading, _decoded = read_evidence(reading, evidence, (code,))
     if reading.code is None or reading.code.digits != code.digits:
         return None
-    return with_pose(replace(reading, from_codebook=False, frames=(expected.number,)), camera)
+    # the code came from another frame, not from the registry: it is as sure as there
+    reading = replace(
+        reading, from_codebook=False, is_registered=expected.is_registered, frames=(expected.number,)
+    )  # fmt: skip
+    return with_pose(with_unseen_damage(reading), camera)
 
 
 @lru_cache(maxsize=16)

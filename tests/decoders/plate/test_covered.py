@@ -8,14 +8,21 @@ import numpy as np
 import pytest
 
 from app.decoders.plate.accumulate import confirm_drive
-from app.decoders.plate.confirm import ADVANCE_ERRORS, DriveFrame, Expected, list_expected, with_expected
+from app.decoders.plate.confirm import (
+    ADVANCE_ERRORS,
+    UNCHECKED_CONFIDENCE,
+    DriveFrame,
+    Expected,
+    list_expected,
+    with_expected,
+)
 from app.decoders.plate.detect_blobs import half_planes, ratio_signal
 from app.decoders.plate.detect_quads import detect_marker_quads
 from app.decoders.plate.follow_plate import expect_plate, find_expected
 from app.decoders.plate.reader import decode_plates, read_plates
 from app.decoders.plate.unit_likelihoods import RISK_BESIDE_HIDDEN, with_hidden_markers
 from app.markers.plate import PlateCode
-from app.markers.reading import PlateOutcome, PlatePose, PlateReading, SymbolEvidence
+from app.markers.reading import Certainty, PlateOutcome, PlatePose, PlateReading, SymbolEvidence
 from app.simulation.plate_face import Face
 from app.simulation.plate_scene import PlacedFace, PlateScene
 from benchmarks.plates.sets import draw_scenes
@@ -152,6 +159,22 @@ def test_a_plate_without_colours_is_found_where_another_frame_places_it() -> Non
     other = shoot(PlacedFace(face_of(OTHER), AHEAD_M + 0.7)).image
     assert find_expected(other, place, CAMERA) is None
     assert find_expected(shoot().image, place, CAMERA) is None
+
+
+def test_digits_without_a_check_are_no_surer_where_another_frame_shows_them() -> None:
+    plain = PlateCode("391204578613")
+    face = face_of(plain)
+    [reading] = decode_plates(shoot(PlacedFace(face, AHEAD_M)).image, camera=CAMERA)
+    assert reading.certainty is Certainty.UNCHECKED
+    place = expect_plate(Expected(7, reading, (-0.5, -0.7, -0.9)), CAMERA)
+    assert place is not None
+    found = find_expected(shoot(PlacedFace(face, AHEAD_M + 0.7)).image, place, CAMERA)
+    assert found is not None
+    assert (found.digits, found.certainty, found.confidence) == (
+        plain.digits,
+        Certainty.UNCHECKED,
+        UNCHECKED_CONFIDENCE,
+    )
 
 
 def test_a_plate_that_is_found_takes_the_place_of_a_refused_one() -> None:
