@@ -100,10 +100,15 @@ class MagnetRecall(NamedTuple):
 def magnet_recall(orientation: Orientation) -> MagnetRecall:
     """The measured table of a kind of magnet."""
     rows = read_figures("magnet_recall.csv")
-    read = np.array([float(row["upright" if orientation is Orientation.UP else "lying"]) for row in rows])
-    count = np.array([float(row["magnets"]) / 2 for row in rows])
-    log_odds = scipy.special.logit((read * count + 0.5) / (count + 1))  # Jeffreys' prior: none is sure
-    return MagnetRecall(np.array([float(row["distance_m"]) for row in rows]), np.asarray(log_odds))
+    kind = "upright" if orientation is Orientation.UP else "lying"
+    read, magnets, distance_m = (_column(rows, name) for name in (kind, "magnets", "distance_m"))
+    count = magnets / 2
+    log_odds: Floats = scipy.special.logit((read * count + 0.5) / (count + 1))  # Jeffreys' prior: none is sure
+    return MagnetRecall(distance_m, log_odds)
+
+
+def _column(rows: Sequence[dict[str, str]], name: str) -> Floats:
+    return np.array([float(row[name]) for row in rows])
 
 
 # === What is checked before a layout is installed: each check with its figure, limit and where the limit comes from.

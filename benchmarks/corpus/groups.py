@@ -44,9 +44,9 @@ def read_group(name: str) -> Counts:
     return reader(folder, read_truth(folder))
 
 
-def read_promises() -> dict[str, dict[str, Promise]]:
+def read_promises(minima: Path = MINIMA) -> dict[str, dict[str, Promise]]:
     """By group and way."""
-    stored = json.loads(MINIMA.read_text()) if MINIMA.exists() else {}
+    stored = json.loads(minima.read_text()) if minima.exists() else {}
     return {group: {way: Promise(*values) for way, values in ways.items()} for group, ways in stored.items()}
 
 
@@ -61,12 +61,12 @@ def broken(promise: Promise | None, count: Count) -> str:
     return ""
 
 
-def raise_promises(found: Mapping[str, Counts]) -> None:
+def raise_promises(found: Mapping[str, Counts], minima: Path = MINIMA) -> None:
     """Raise each promise to what is read now; none is lowered, and no more wrong readings become known.
 
     Only a way of reading without a promise gets its first one, with the wrong readings that it has.
     """
-    promises = read_promises()
+    promises = read_promises(minima)
     for group, counts in found.items():
         ways = promises.setdefault(group, {})
         for way, count in counts.items():
@@ -76,4 +76,4 @@ def raise_promises(found: Mapping[str, Counts]) -> None:
     for group in sorted(promises):
         ways_text = [f"  {json.dumps(way)}: [{p.least}, {p.known_wrong}]" for way, p in promises[group].items()]
         rows.append(f" {json.dumps(group)}: {{\n" + ",\n".join(ways_text) + "\n }")
-    MINIMA.write_text("{\n" + ",\n".join(rows) + "\n}\n")
+    minima.write_text("{\n" + ",\n".join(rows) + "\n}\n")

@@ -45,7 +45,7 @@ from benchmarks.plates.schemes import CANDIDATES, draw_places
 from benchmarks.plates.sets import draw_light, draw_scenes
 from benchmarks.plates.views import draw_background, draw_camera
 from benchmarks.scenes.places import draw_occluder, draw_place, scene_under
-from benchmarks.scenes.road_weather import (
+from benchmarks.scenes.hunted_weather import (
     Water,
     dusk,
     lay,

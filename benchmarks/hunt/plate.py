@@ -23,7 +23,7 @@ from benchmarks.plates.evaluate import find_right
 from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
 from benchmarks.plates.schemes import CANDIDATES, draw_places
 from benchmarks.plates.views import draw_background
-from benchmarks.scenes.road_weather import (
+from benchmarks.scenes.hunted_weather import (
     Water,
     dusk,
     lay,

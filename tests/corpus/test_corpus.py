@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import pytest
 
-from benchmarks.corpus import groups
 from benchmarks.corpus.counts import RECORDINGS, Count
 from benchmarks.corpus.groups import Promise, broken, list_groups, raise_promises, read_group, read_promises
 
@@ -61,9 +60,13 @@ def test_a_promise_is_broken_by_one_reading_less_or_a_wrong_one(count: Count, fa
     assert broken(Promise(7), count) == fault
 
 
-def test_promises_are_raised_and_never_lowered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(groups, "MINIMA", tmp_path / "minima.json")
-    raise_promises({"a": {"alone": Count(10, 5, ("x", "y")), "turned": Count(10, 5)}})
-    assert read_promises() == {"a": {"alone": Promise(5, 2), "turned": Promise(5)}}
-    raise_promises({"a": {"alone": Count(10, 4, ("x",)), "turned": Count(10, 7, ("z",))}, "b": {"alone": Count(3, 3)}})
-    assert read_promises() == {"a": {"alone": Promise(5, 1), "turned": Promise(7)}, "b": {"alone": Promise(3)}}
+def test_promises_are_raised_and_never_lowered(tmp_path: Path) -> None:
+    minima = tmp_path / "minima.json"
+    raise_promises({"a": {"alone": Count(10, 5, ("x", "y")), "turned": Count(10, 5)}}, minima)
+    assert read_promises(minima) == {"a": {"alone": Promise(5, 2), "turned": Promise(5)}}
+    later = {"a": {"alone": Count(10, 4, ("x",)), "turned": Count(10, 7, ("z",))}, "b": {"alone": Count(3, 3)}}
+    raise_promises(later, minima)
+    assert read_promises(minima) == {
+        "a": {"alone": Promise(5, 1), "turned": Promise(7)},
+        "b": {"alone": Promise(3)},
+    }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from pyproj import Geod
@@ -111,26 +113,28 @@ def test_the_proven_range_is_where_the_measured_recall_ends() -> None:
         assert recall.share_at(1.0) < 0.06
 
 
-def depth_of(name: str, **installation: object) -> Check:
-    fixed = Installation(**installation)  # type: ignore[arg-type]
+ON_SURFACE = Installation(MagnetMounting.SURFACE)
+
+
+def check_of(name: str, fixed: Installation = Installation()) -> Check:
     layout = place_tag(STRAIGHT, TAG, 50.0, name="tag", installation=fixed)
     return {c.name: c for c in check_layout(layout, Site(vehicles=("sedan",)))}[name]
 
 
 def test_the_depth_of_magnets_adds_to_the_clearance() -> None:
-    flush, deep = (depth_of("clearance-sedan", hole_depth_mm=depth) for depth in (30.0, 300.0))
+    flush, deep = (check_of("clearance-sedan", Installation(hole_depth_mm=depth)) for depth in (30.0, 300.0))
     assert deep.figure - flush.figure == pytest.approx(0.27)
     assert (flush.passed, deep.passed) == (True, False)
     assert "29.5 cm deep" in deep.note
-    assert depth_of("clearance-sedan", mounting="surface").figure == depth_of("clearance-sedan").figure < flush.figure
+    assert check_of("clearance-sedan", ON_SURFACE).figure == check_of("clearance-sedan").figure < flush.figure
 
 
 def test_shells_on_the_road_are_no_higher_than_raised_markers() -> None:
-    assert depth_of("shell-height", mounting="surface").passed
-    assert depth_of("shell-height", mounting="surface", shell_height_mm=25.0).passed
-    assert not depth_of("shell-height", mounting="surface", shell_height_mm=30.0).passed
+    assert check_of("shell-height", ON_SURFACE).passed
+    assert check_of("shell-height", replace(ON_SURFACE, shell_height_mm=25.0)).passed
+    assert not check_of("shell-height", replace(ON_SURFACE, shell_height_mm=30.0)).passed
     with pytest.raises(KeyError):
-        depth_of("shell-height")
+        check_of("shell-height")
 
 
 @pytest.mark.parametrize(
@@ -141,9 +145,9 @@ def test_shells_on_the_road_are_no_higher_than_raised_markers() -> None:
         ({"shell_height_mm": 15.0}, "shell_height_mm"),
     ],
 )
-def test_a_size_of_the_other_mounting_is_refused(installation: dict[str, object], field: str) -> None:
+def test_a_size_of_the_other_mounting_is_refused(installation: dict[str, Any], field: str) -> None:
     with pytest.raises(InvalidParameter) as caught:
-        Installation(**installation)  # type: ignore[arg-type]
+        Installation(**installation)
     assert caught.value.field == field
     assert caught.value.limit
     assert caught.value.cure
@@ -229,7 +233,7 @@ def test_a_line_costs_less_than_the_cheapest_paint() -> None:
 
 
 def test_magnets_on_the_surface_are_billed_with_shells_and_adhesive() -> None:
-    layout = place_tag(STRAIGHT, TAG, 50.0, name="tag", installation=Installation(mounting=MagnetMounting.SURFACE))
+    layout = place_tag(STRAIGHT, TAG, 50.0, name="tag", installation=ON_SURFACE)
     bill = bill_of_materials(layout)
     assert bill.total_usd == 3.0  # METRO section 8.1: 1 USD each, of it 0.25 for the shell
     assert [(row.cost.item, row.quantity, row.high_usd) for row in bill.materials] == [

@@ -225,9 +225,11 @@ def test_lines_keep_off_the_turns_of_wheels() -> None:
 
 
 def test_longer_tags_keep_their_codes_at_high_speed_above_deep_magnets() -> None:
-    fast = {"speed_kmh": 130.0, "installation": {"hole_depth_mm": 200}}
-    short = magnets_on(**fast, tags={"at": ["speed_limit"]})  # type: ignore[arg-type]
-    long = magnets_on(**fast, tags={"at": ["speed_limit"], "size": "freeway"})  # type: ignore[arg-type]
+    deep = {"hole_depth_mm": 200}
+    short, long = (
+        magnets_on(speed_kmh=130.0, installation=deep, tags={"at": ["speed_limit"]} | size)
+        for size in ({}, {"size": "freeway"})
+    )
     assert [tag.detail.tag.length_m for tag in long.markers if isinstance(tag.detail, PlannedTag)] == [12.0]
     assert finding(short, "tag-resolution").verdict is Verdict.WARN
     assert "tags.size: freeway" in finding(short, "tag-resolution").sentence

@@ -1,4 +1,6 @@
-"""Weather on a road with a plate: snow, sand, water that mirrors lights, dusk; and shaking and very wide cameras.
+"""Weather of the hunt and the corpus: snow, sand, water that mirrors lights, dusk; shaking and very wide cameras.
+
+It is a second model beside that of `weather`, on whose sets the decoder was tuned, and shares no code with it.
 
 Each function takes a scene (and the photo behind it), and returns it changed; what it is called with draws everything.
 Layers lie in the ground frame, on plate and road alike, so perspective, blur, noise and JPEG act on them as on paint.
