@@ -44,7 +44,6 @@ from benchmarks.magnets.scenes import LEAD_M, random_magnets, random_tag
 from benchmarks.plates.schemes import CANDIDATES, draw_places
 from benchmarks.plates.sets import draw_light, draw_scenes
 from benchmarks.plates.views import draw_background, draw_camera
-from benchmarks.scenes.places import draw_occluder, draw_place, scene_under
 from benchmarks.scenes.hunted_weather import (
     Water,
     dusk,
@@ -56,6 +55,7 @@ from benchmarks.scenes.hunted_weather import (
     wet,
     wide_camera,
 )  # fmt: skip
+from benchmarks.scenes.places import draw_occluder, draw_place, scene_under
 from benchmarks.scenes.thermal import draw_thermal, render_thermal_scene, warm_face
 from benchmarks.video.drive import DriveShape, write_drive
 
