@@ -134,7 +134,7 @@ BLUR_PRIOR = (math.log(0.7), 0.35)
 (`simulation.conditions`)."""
 MOTION_PRIOR = (0.001, 0.02)
 """[plate sides^2] mean and standard deviation of the square of the motion's length. 50 km/h at 1/500 s are 0.028 m,
-0.007 plate sides squared."""
+0.007 plate sides squared; at dusk exposures are two to three times as long."""
 MIN_COARSE_EXPLAINED = (0.3, 0.74, 0.8, 0.83, 0.85, 0.85)
 """[1] share of the pixels' variance that the best values explain in each of the first steps on anything that is a
 plate."""

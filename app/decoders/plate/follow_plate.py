@@ -16,7 +16,7 @@ from app.decoders.plate import Array
 from app.decoders.plate.confirm import Expected, with_unseen_damage
 from app.decoders.plate.detect_blobs import difference_signal, half_planes
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
-from app.decoders.plate.fit import fit_plate, project
+from app.decoders.plate.fit import PlateFit, fit_plate, project
 from app.decoders.plate.marker_colours import measure_marker_colours
 from app.decoders.plate.pose import marker_centroids, unit_edges, with_pose
 from app.decoders.plate.unit_likelihoods import unit_log_likelihoods, with_hidden_markers
@@ -135,19 +135,11 @@ def expect_plate(expected: Expected, camera: Camera) -> ExpectedPlate | None:
 def find_expected(image: Array, expected: ExpectedPlate, camera: Camera | None = None) -> PlateReading | None:
     """The reading of a plate that is expected in a frame, by its pattern; None where it is not seen.
 
-    Its pattern is projected to each place and compared with the frame around it. Where they are most alike the plate is
-    fitted, and its units must show the code as those of a registered plate must (`decode_symbols`). No colours are
-    needed, so that markers may be covered, mirrored over or too weak to be found.
+    Its units must show the code as those of a registered plate must (`decode_symbols`). No colours are needed, so that
+    markers may be covered, mirrored over or too weak to be found.
     """
     code, geometry = expected.code, expected.geometry
-    grey, pattern = _grey(image), _grey_pattern(code, geometry)
-    ends = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32) * len(pattern)
-    matches = [(*_best_match(grey, pattern, ends, place), place) for place in expected.places_px]
-    likeness, shift, place = max(matches, key=lambda match: match[0])
-    if likeness < MIN_EXPECTED_LIKENESS:
-        return None
-    image_from_plate = cv2.getPerspectiveTransform(_UNIT_SQUARE, (place + shift).astype(np.float32))
-    fit = fit_plate(image, project(np.asarray(image_from_plate, float), marker_centroids(geometry)), geometry)
+    fit = _fit_expected(image, expected)
     units = None if fit is None else unit_log_likelihoods(fit)
     if fit is None or units is None:
         return None
@@ -171,6 +163,19 @@ def find_expected(image: Array, expected: ExpectedPlate, camera: Camera | None =
         reading, from_codebook=False, is_registered=expected.is_registered, frames=(expected.number,)
     )  # fmt: skip
     return with_pose(with_unseen_damage(reading), camera)
+
+
+def _fit_expected(image: Array, expected: ExpectedPlate) -> PlateFit | None:
+    """The plate fitted where the frame is most like its pattern, of the places where it may be."""
+    geometry = expected.geometry
+    grey, pattern = _grey(image), _grey_pattern(expected.code, geometry)
+    ends = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32) * len(pattern)
+    matches = [(*_best_match(grey, pattern, ends, place), place) for place in expected.places_px]
+    likeness, shift, place = max(matches, key=lambda match: match[0])
+    if likeness < MIN_EXPECTED_LIKENESS:
+        return None
+    image_from_plate = cv2.getPerspectiveTransform(_UNIT_SQUARE, (place + shift).astype(np.float32))
+    return fit_plate(image, project(np.asarray(image_from_plate, float), marker_centroids(geometry)), geometry)
 
 
 @lru_cache(maxsize=16)
