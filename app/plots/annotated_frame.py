@@ -12,7 +12,8 @@ import numpy.typing as npt
 from app.lanes.overlay import LaneInFrame
 
 Pixels = npt.NDArray[np.uint8]
-_BGR = {"read": (80, 220, 60), "unsure": (40, 190, 250), "not-in-registry": (40, 190, 250)}
+_UNSURE_BGR = (40, 190, 250)
+_BGR = {"read": (80, 220, 60)} | dict.fromkeys(("unchecked", "unsure", "not-in-registry"), _UNSURE_BGR)
 _REFUSED_BGR = (90, 90, 240)
 _DARK_BGR = (25, 25, 25)
 _LANE_BGR, _LANE_SHARE = (90, 200, 70), 0.32

@@ -179,7 +179,7 @@ _SURFACE_NOTE = (
 )
 
 _HOLE_COLUMNS: tuple[tuple[str, float, Callable[[Hole, float], str]], ...] = (
-    ("magnet", 24.0, lambda hole, gap: str(hole.number)),
+    ("magnet", 26.0, lambda hole, gap: str(hole.number)),
     ("from first [m]", 50.0, lambda hole, gap: fixed(hole.along_m, 3)),
     ("from previous [m]", 78.0, lambda hole, gap: fixed(gap, 3) if hole.number > 1 else "-"),
     ("chainage [m]", 100.0, lambda hole, gap: fixed(hole.chainage_m, 3)),

@@ -14,6 +14,7 @@ from app.errors import NotFound
 from app.formats.format import SpooledFile, read_member
 from app.formats.text import TableWriter
 from app.lanes.types import LeftOutReason
+from app.markers.reading import Certainty
 from app.plots.annotated_frame import Outline
 from app.registry import decodes as store
 from app.registry.database import Database
@@ -41,7 +42,8 @@ class ReadingRow(TypedDict):
     """One reading of any family.
 
     `time` is UTC, `time_s` seconds since 1970 where the clock is `utc`, else of the recording. `outcome` is that of the
-    reading: of a plate or sign whether it was read, of a tag its direction, of a CERPM `received` or `left-out`.
+    reading: of a plate or sign whether it was read, or `unchecked`, that is read without a check or a registered plate
+    that confirms the digits; of a tag its direction; of a CERPM `received` or `left-out`.
     The place is that of the marker: of the registered one, else of what was read.
     """
 
@@ -124,7 +126,7 @@ def _frame_readings(result: StoredResult, clock: DecodeTimes) -> Iterator[Readin
             "time_s": time_s,
             "frame": reading["frame"],
             "family": reading.get("family", "plate"),
-            "outcome": reading["outcome"],
+            "outcome": _shown_outcome(reading),
             "code": reading.get("digits") or reading.get("likely_digits"),
             "confidence": reading.get("confidence"),
             "reason": reading.get("reason") or match.get("note"),
@@ -134,6 +136,12 @@ def _frame_readings(result: StoredResult, clock: DecodeTimes) -> Iterator[Readin
             "lon_deg": match.get("lon_deg"),
             "lat_deg": match.get("lat_deg"),
         }
+
+
+def _shown_outcome(reading: StoredResult) -> str:
+    """That of a reading; of digits that nothing confirms, that."""
+    unchecked = Certainty.UNCHECKED.value
+    return unchecked if reading.get("certainty") == unchecked else str(reading["outcome"])
 
 
 def _tag(tag: StoredResult, clock: DecodeTimes) -> ReadingRow:
@@ -299,4 +307,4 @@ class DecodeOutputs:
 def _outline(reading: StoredResult) -> Outline:
     corners = tuple((float(x), float(y)) for x, y in reading["corners_px"] or ())
     label = f"{reading['digits']} {reading['confidence']:.1%}" if reading["digits"] else reading["outcome"]
-    return Outline(corners, reading["outcome"], label)
+    return Outline(corners, _shown_outcome(reading), label)

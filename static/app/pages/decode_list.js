@@ -10,8 +10,11 @@ import { query, setQuery } from "../router.js";
 import { t, textOr } from "../texts/index.js";
 
 const LEVELS = /** @type {Record<string, "good" | "warn" | "bad" | "none">} */ ({
-  read: "good", legal: "good", received: "good", unsure: "warn", unknown: "warn", "not-in-registry": "warn",
+  read: "good", legal: "good", received: "good", unchecked: "warn", unsure: "warn", unknown: "warn", "not-in-registry": "warn",
 });
+
+/** How a plate is shown: digits that nothing confirms are unchecked. @param {any} reading @returns {string} */
+export const outcomeOf = (reading) => (reading.certainty === "unchecked" ? "unchecked" : reading.outcome);
 
 /** @param {string} outcome */
 export const levelOf = (outcome) => LEVELS[outcome] ?? "bad";

@@ -2,8 +2,9 @@
 
 import { number } from "../format.js";
 import { t, textOr } from "../texts/index.js";
+import { outcomeOf } from "./decode_list.js";
 
-const COLOURS = /** @type {Record<string, string>} */ ({ read: "#3cdc50", unsure: "#fabe28" });
+const COLOURS = /** @type {Record<string, string>} */ ({ read: "#3cdc50", unchecked: "#fabe28", unsure: "#fabe28" });
 const REFUSED = "#f05a5a";
 const MARGIN = 2.2; // of the part of a frame around a reading, over its size
 const PLAIN = { unit_mm: 35, gap_mm: 5 };
@@ -40,7 +41,7 @@ export function viewOf(corners, image) {
 export function drawReading(pen, reading, place, layers, isChosen, size) {
   if (!reading.corners_px?.length) return;
   const corners = reading.corners_px.map(place);
-  const colour = COLOURS[reading.outcome] ?? REFUSED;
+  const colour = COLOURS[outcomeOf(reading)] ?? REFUSED;
   const units = unitsOf(reading);
   const at = units ? homography(corners) : null;
   if (units && at && layers.has("bits")) drawBits(pen, units, at);

@@ -9,6 +9,7 @@ import { Empty } from "../components/load.js";
 import { PlacePlot } from "../components/place_plot.js";
 import { degrees, number } from "../format.js";
 import { t, textOr } from "../texts/index.js";
+import { levelOf, outcomeOf } from "./decode_list.js";
 
 /** @param {{ readings: any[], image: HTMLImageElement | null }} props */
 export function Readings({ readings, image }) {
@@ -19,11 +20,10 @@ export function Readings({ readings, image }) {
 /** @param {{ reading: any, image: HTMLImageElement | null }} props */
 function Reading({ reading, image }) {
   const { match, grade } = reading;
-  const shown = reading.certainty === "unchecked" ? "unchecked" : reading.outcome;
-  const level = shown === "read" ? "good" : shown === "unsure" || shown === "unchecked" ? "warn" : "bad";
+  const shown = outcomeOf(reading);
   return html`
     <article class="reading">
-      <h3><${Verdict} level=${level}>${textOr(`outcome.${shown}`, shown)}</${Verdict}> <span class="code">${reading.digits}</span></h3>
+      <h3><${Verdict} level=${levelOf(shown)}>${textOr(`outcome.${shown}`, shown)}</${Verdict}> <span class="code">${reading.digits}</span></h3>
       <${Facts} of=${[
         [t("field.reason"), reading.reason],
         [t("decode.confidence"), `${number(100 * reading.confidence, 3, "%")}${reading.from_codebook ? `, ${t("decode.from_registered")}` : ""}`],

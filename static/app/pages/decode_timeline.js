@@ -88,7 +88,7 @@ function build(sources) {
     for (const { at } of source.frames) if (Number.isFinite(at)) moments.add(at + source.shift);
   }
   if (!(from <= to)) [from, to] = [0, 0];
-  const read = sources.flatMap(({ readings, shift }) => readings.filter(({ at }) => Number.isFinite(at)).map(({ at, outcome }) => ({ at: at + shift, late: outcome === "read" ? 0 : 1 })));
+  const read = sources.flatMap(({ readings, shift }) => readings.filter(({ at }) => Number.isFinite(at)).map(({ at, outcome }) => ({ at: at + shift, late: outcome === "read" || outcome === "unchecked" ? 0 : 1 })));
   const first = read.sort((a, b) => a.late - b.late || a.at - b.at)[0]?.at;
   const clock = together ? "recording" : sources[0]?.clock ?? "recording";
   return { sources, from, to, first, clock, moments: [...moments].sort((a, b) => a - b), text: textOf(clock, from) };

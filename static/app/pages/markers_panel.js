@@ -45,6 +45,7 @@ export function MarkerPanel({ id, onClose, onChanged }) {
           </p>
         `}
         <${Facts} of=${factsOf(data)} />
+        ${data.family === "plate" && data.code_warnings.map((/** @type {any} */ warning) => html`<p class="warning">${warning.message}</p>`)}
         <${Section} title=${t("marker.files")} open>${() => html`<${FilesOf} marker=${data} />`}</${Section}>
         <${Section} title=${t("marker.position")}>${() => html`<${PositionOf} marker=${data} />`}</${Section}>
         <${Section} title=${t("marker.health")}>${() => html`<${HealthOf} id=${id} />`}</${Section}>
@@ -96,7 +97,7 @@ function factsOfFamily(marker) {
     code.scheme === "line-tag" ? [t("marker.line_style"), textOr(`option.${code.style}`, code.style)] : [t("marker.meaning"), code.meaning?.text],
     [t("marker.magnets"), t("marker.magnets_text", { count: marker.magnets.length, length: number(marker.length_m, 2) })],
     [t("marker.place_in_lane"), "chainage_m" in layout ? t("marker.chainage", { chainage: number(layout.chainage_m, 2), offset: number(layout.offset_m, 2) }) : t("marker.chainage_range", { from: layout.from_m, to: layout.to_m ?? "…" })],
-    [t("rules.installation"), installationText(marker)],
+    [t("marker.mounting"), installationText(marker)],
     [t("marker.cost"), number(marker.bill.total_usd, 2, "USD")],
   ];
 }
@@ -104,6 +105,8 @@ function factsOfFamily(marker) {
 /** How the magnets are fixed, and how deep. @param {Schemas["MagnetDetailDocument"]} marker */
 function installationText({ installation, depth_m: depth }) {
   const mounting = textOr(`option.${installation.mounting}`, String(installation.mounting));
+  const high = installation.shell_height_mm;
+  if (high) return t("marker.mounted_high", { mounting, height: number(high, 0, "mm") });
   return depth > 0 ? t("marker.mounted_deep", { mounting, depth: number(1000 * depth, 0, "mm") }) : mounting;
 }
 
@@ -131,7 +134,7 @@ function PositionOf({ marker }) {
       [t("field.survey_file_sha256"), position.survey_file_sha256 && html`<span class="code small">${position.survey_file_sha256}</span>`],
     ]} />
     ${original.length > 0 && html`<h4>${t("marker.original")}</h4><${Facts} of=${original.map(([name, value]) => [textOr(`field.${name}`, name), String(value)])} />`}
-    ${[...(marker.position_warnings ?? []), ...(marker.family === "plate" ? marker.code_warnings : [])].map((/** @type {any} */ warning) => html`<p class="warning">${warning.message}</p>`)}
+    ${(marker.position_warnings ?? []).map((/** @type {any} */ warning) => html`<p class="warning">${warning.message}</p>`)}
   `;
 }
 

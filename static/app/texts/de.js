@@ -1297,6 +1297,8 @@ export default {
   "marker.message": "Nachricht",
   "marker.message_hidden": "Planer und Administratoren sehen die Nachricht.",
   "marker.mounted_deep": "{mounting}, {depth} von der Fahrbahn bis zur Mitte der Magnete",
+  "marker.mounted_high": "{mounting}, in Gehäusen von {height} Höhe",
+  "marker.mounting": "Einbau",
   "marker.no_change": "Nichts wurde geändert",
   "marker.no_change_cure": "ändern Sie ein Feld, oder schließen Sie den Dialog",
   "marker.no_history": "Es gibt keinen Verlauf.",

@@ -1297,6 +1297,8 @@ export default {
   "marker.message": "Message",
   "marker.message_hidden": "Planners and admins can see the message.",
   "marker.mounted_deep": "{mounting}, {depth} from the road down to the middle of the magnets",
+  "marker.mounted_high": "{mounting}, in shells {height} high",
+  "marker.mounting": "Mounting",
   "marker.no_change": "Nothing was changed",
   "marker.no_change_cure": "change a field, or close the dialog",
   "marker.no_history": "There is no history.",
