@@ -62,7 +62,9 @@ def plot_track(track: Track, name: str) -> str:
     body += ellipses
     for result, (e, n) in zip(track.fixes, fix_m, strict=False):
         x, y = east.at(float(e)), north.at(float(n))
-        title = f"{result.fix.family} {result.fix.marker_id or ''}: {result.distance:.1f} standard deviations"
+        title = f"{result.fix.family} {result.fix.marker_id or ''}"
+        if math.isfinite(result.distance):
+            title += f": {result.distance:.1f} standard deviations"
         body.append(circle(x, y, 3, GREEN, title) if result.used else cross(x, y, 5, RED, 2.0, title))
     parts = [heading(_MAP.left, 20, f"{name}: {track.length_m:.0f} m"), _legend(factor), _MAP.frame()]
     parts += _MAP.clipped("map", body)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -164,10 +165,15 @@ def fix_marker(result: FixResult) -> DriveMarker:
         time=time_text(result.time_s),
         lon_deg=fix.lon_deg,
         lat_deg=fix.lat_deg,
-        distance=round(result.distance, 3),
-        along_m=round(result.along_m, 3),
-        across_m=round(result.across_m, 3),
+        distance=_rounded(result.distance),
+        along_m=_rounded(result.along_m),
+        across_m=_rounded(result.across_m),
     )
+
+
+def _rounded(value: float) -> float | None:
+    """To three decimals; None where no other fix gives a track."""
+    return round(value, 3) if math.isfinite(value) else None
 
 
 def _marker_feature(marker: DriveMarker) -> dict[str, object]:

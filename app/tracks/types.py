@@ -175,7 +175,7 @@ class FixResult:
     used: bool
     reason: LeftOutReason | None
     time_s: float  # [s] on the reference clock
-    distance: float  # Mahalanobis distance to the track that the other fixes give
+    distance: float  # Mahalanobis distance to the track that the other fixes give; NaN where there is none
     # `along_m`, `across_m`: [m] from that track, forward and left positive
     along_m: float
     across_m: float

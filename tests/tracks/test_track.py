@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 
@@ -10,8 +11,10 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.geodesy.frames import metres_per_radian
+from app.plots.track import plot_track
 from app.tracks import Clock, ClockState, LanePath, LeftOutReason, Samples, TrackInput, TrackRules
 from app.tracks.estimate import estimate_track
+from app.tracks.files import fix_marker, write_geojson
 from tests.tracks.drives import T0_S, drive, recording
 
 
@@ -202,6 +205,18 @@ def test_a_single_fix_without_anything_else() -> None:
     track = estimate_track(seen.track_input(samples=False))
     assert len(track.time_s) >= 1
     assert np.isfinite(track.covariance_m2).all()
+
+
+def test_a_fix_without_a_track_by_others_is_written_without_a_distance_from_it() -> None:
+    seen = recording(drive(5))
+    seen.see(2.0, heading=False)
+    track = estimate_track(seen.track_input(samples=False))
+    unknown = replace(track.fixes[0], distance=math.nan, along_m=math.nan, across_m=math.nan)
+    marker = fix_marker(unknown)
+    assert (marker.used, marker.distance, marker.along_m, marker.across_m) == (True, None, None, None)
+    features = json.loads(write_geojson(track, "one", [marker]))["features"]
+    assert [one["properties"]["distance"] for one in features if one["properties"]["kind"] == "marker"] == [None]
+    assert "nan" not in plot_track(replace(track, fixes=(unknown,)), "one")
 
 
 def test_many_fixes_of_one_marker_at_a_standstill_are_no_better_than_their_survey() -> None:
