@@ -94,6 +94,10 @@ def parse_input(model: type[ModelT], document: object, *where: str) -> ModelT:
         raise first from None
 
 
+_OBJECTS = {"dataclass_type", "dict_type", "model_attributes_type", "model_type"}
+"""Types of pydantic's errors, whose messages name Python's types, for what is no JSON object."""
+
+
 def input_error(item: Mapping[str, object], path: list[str], whole: str = "body") -> InvalidParameter:
     """The fault that an error of pydantic names, at a path of the input; an empty path is that of the `whole`."""
     at = ".".join(path) or whole
@@ -106,10 +110,11 @@ def input_error(item: Mapping[str, object], path: list[str], whole: str = "body"
         return InvalidParameter(cause.message, field=field, limit=cause.limit, cure=cause.cure or _cure(field))
     near = f"did you mean {context['near']}? If not, " if "near" in context else ""
     cures = {"missing": f"send {at}", "extra_forbidden": f"{near}leave {at} out"}
+    message = "Input should be an object" if item["type"] in _OBJECTS else str(item["msg"])
     return InvalidParameter(
-        f"{at}: {item['msg']}",
+        f"{at}: {message}",
         field=at,
-        limit=", ".join(limits) or str(item["msg"]),
+        limit=", ".join(limits) or message,
         cure=cures.get(str(item["type"]), _cure(at)),
     )
 
