@@ -25,7 +25,7 @@ from app.calibration.board_view import (
     ViewReport,
 )
 from app.errors import CalibrationRefused, InvalidParameter, UnreadableUpload, WaymarkError
-from app.sensors.camera import CalibrationBoard
+from app.sensors.camera import CalibrationBoard, Camera
 from app.values import Floats
 
 VERSION = "calibration/1"
@@ -283,20 +283,13 @@ def _check(found: CameraCalibration, rules: CalibrationRules) -> None:
 
 def is_invertible(camera: CalibratedCamera) -> bool:
     """Whether each pixel of the image's edge has its own ray: undistorted and distorted again, it is the same pixel."""
-    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    lens = Camera(
+        camera.width_px, camera.height_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion
+    )
     w, h = camera.width_px - 1.0, camera.height_px - 1.0
     edge = np.array([(x, y) for x in np.linspace(0, w, 9) for y in (0.0, h)] + [(x, h / 2) for x in (0.0, w)])
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-    distortion = np.array(camera.distortion)
-    rays = cv2.undistortPoints(edge.reshape(-1, 1, 2), matrix, distortion, None, None, None, criteria)
-    back, _ = cv2.projectPoints(
-        np.concatenate([rays.reshape(-1, 2), np.ones((len(edge), 1))], axis=1),
-        np.zeros(3),
-        np.zeros(3),
-        matrix,
-        distortion,
-    )
-    return bool(np.linalg.norm(back.reshape(-1, 2) - edge, axis=1).max() < MAX_TURN_BACK_PX)
+    back = lens.project(np.column_stack([lens.undistort(edge), np.ones(len(edge))]))
+    return bool(np.linalg.norm(back - edge, axis=1).max() < MAX_TURN_BACK_PX)
 
 
 def _refusal(

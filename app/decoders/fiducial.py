@@ -232,8 +232,7 @@ def stand_upright(corners_px: Floats, camera: Camera) -> tuple[Floats, int]:
     corners_px : ndarray, shape (4, 2)
         Clockwise from any corner. [px]
     """
-    distortion = np.array(camera.distortion or (0.0,) * 4)
-    rays = cv2.undistortPoints(corners_px.reshape(4, 1, 2), camera.matrix, distortion).reshape(4, 2)
+    rays = camera.undistort(corners_px)
     up, centre = camera.camera_from_vehicle[:, 2], rays.mean(axis=0)
     vertical = up[:2] - centre * up[2]  # the direction in which the image of a point moves as the point moves up
     sides = [rays[k] - rays[k - 1] + rays[(k + 1) % 4] - rays[(k + 2) % 4] for k in range(4)]
@@ -262,14 +261,13 @@ def locate_fiducial(corners_px: Floats, geometry: FiducialGeometry, camera: Came
         Axes x right, y travel, z up, as a plate's; None when no pose in front of the camera projects to the corners.
     """
     object_m = np.column_stack([geometry.corners_mm / 1000, np.zeros(4)])
-    distortion = np.array(camera.distortion or (0.0,) * 4)
     found, rotations, translations, _ = cv2.solvePnPGeneric(
-        object_m, corners_px.reshape(4, 1, 2), camera.matrix, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        object_m, camera.undistort(corners_px), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
     if not found:
         return None
     starts = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
-    refined = [_refine(start, corners_px, object_m, geometry.mounting, camera, distortion) for start in starts]
+    refined = [_refine(start, corners_px, object_m, geometry.mounting, camera) for start in starts]
     best = min((r for r in refined if r is not None), key=lambda r: r[0], default=None)
     if best is None:
         return None
@@ -277,7 +275,7 @@ def locate_fiducial(corners_px: Floats, geometry: FiducialGeometry, camera: Came
     rotation = np.asarray(cv2.Rodrigues(pose[:3])[0], dtype=np.float64)
     if geometry.mounting is Mounting.UPRIGHT:
         rotation = rotation @ _SIGN_FROM_PLATE
-    residual = _corner_residuals(pose, corners_px, object_m, camera, distortion)
+    residual = _corner_residuals(pose, corners_px, object_m, camera)
     return PlatePose(
         rotation=rotation,
         translation_m=pose[3:].copy(),
@@ -287,7 +285,7 @@ def locate_fiducial(corners_px: Floats, geometry: FiducialGeometry, camera: Came
 
 
 def _refine(
-    pose: Floats, corners_px: Floats, object_m: Floats, mounting: Mounting, camera: Camera, distortion: Floats
+    pose: Floats, corners_px: Floats, object_m: Floats, mounting: Mounting, camera: Camera
 ) -> tuple[float, Floats, Floats] | None:
     """Gauss-Newton on corners and mounting: cost, pose (rotation vector, translation), information.
 
@@ -295,7 +293,7 @@ def _refine(
     """
 
     def residuals(at: Floats) -> Floats:
-        corners = _corner_residuals(at, corners_px, object_m, camera, distortion) / CORNER_SIGMA_PX
+        corners = _corner_residuals(at, corners_px, object_m, camera) / CORNER_SIGMA_PX
         return np.concatenate([corners, _tilt(at, mounting, camera) / TILT_SIGMA_RAD])
 
     information = np.eye(6)
@@ -325,8 +323,8 @@ def _moved(pose: Floats, step: Floats) -> Floats:
     return np.concatenate([cv2.Rodrigues(rotation)[0].ravel(), pose[3:] + step[3:]])
 
 
-def _corner_residuals(pose: Floats, corners_px: Floats, object_m: Floats, camera: Camera, distortion: Floats) -> Floats:
-    projected = cv2.projectPoints(object_m, pose[:3], pose[3:], camera.matrix, distortion)[0]
+def _corner_residuals(pose: Floats, corners_px: Floats, object_m: Floats, camera: Camera) -> Floats:
+    projected = cv2.projectPoints(object_m, pose[:3], pose[3:], camera.matrix, camera.lens)[0]
     return np.asarray(projected, dtype=np.float64).reshape(8) - corners_px.reshape(8)
 
 

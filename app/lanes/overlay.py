@@ -19,7 +19,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypedDict
@@ -249,12 +248,8 @@ def _field_of_view(camera: Camera) -> Floats:
     )
     ideal = (border - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
     if camera.distortion:
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-        lens = np.array(camera.distortion)
-        ideal = np.asarray(
-            cv2.undistortPoints(border[:, None], camera.matrix, lens, None, None, None, stop)[:, 0], float
-        )
-        back = _project(np.column_stack([ideal, np.ones(len(ideal))]), camera)
+        ideal = camera.undistort(border)
+        back = camera.project(np.column_stack([ideal, np.ones(len(ideal))]))
         if not np.abs(back - border).max() < _MAX_BORDER_ERROR_PX:
             raise InvalidParameter(
                 "the distortion folds the camera's own picture over",
@@ -267,19 +262,11 @@ def _field_of_view(camera: Camera) -> Floats:
     return np.array([[1, 0, -x0], [-1, 0, x1], [0, 1, -y0], [0, -1, y1]], float)
 
 
-def _project(points_m: Floats, camera: Camera) -> Floats:
-    """Images of points in the camera frame, shape (N, 2). [px]"""
-    if not len(points_m):
-        return np.empty((0, 2))
-    zero, distortion = np.zeros(3), np.array(camera.distortion or [0.0] * 4)
-    return np.asarray(cv2.projectPoints(points_m, zero, zero, camera.matrix, distortion)[0][:, 0], float)
-
-
 def _images(points_m: Floats, camera: Camera, view: Floats) -> PointsInFrame:
     ahead = points_m[:, 2]
     seen = (ahead >= NEAR_M) & (points_m @ view.T >= 0).all(axis=1)
     image = np.full((len(points_m), 2), np.nan)
-    image[seen] = _project(points_m[seen], camera)
+    image[seen] = camera.project(points_m[seen])
     u, v = image.T
     inside = (u >= -0.5) & (u <= camera.width_px - 0.5) & (v >= -0.5) & (v <= camera.height_px - 0.5)
     return PointsInFrame(image, inside, ahead.copy())
@@ -334,7 +321,7 @@ def _line_in_frame(points_m: Floats, camera: Camera, view: Floats, far_m: float)
     pieces = [points_m[run] for run in _runs(np.isfinite(points_m).all(axis=1))]
     for plane, offset in _bounds(view, far_m):
         pieces = _cut_lines(pieces, plane, offset)
-    images = [_project(_curve(piece, camera), camera) for piece in pieces]
+    images = [camera.project(_curve(piece, camera)) for piece in pieces]
     for plane, offset in _frame_edges(camera):
         images = _cut_lines(images, plane, offset)
     return LineInFrame(_images(points_m, camera, view), tuple(images))
@@ -346,7 +333,7 @@ def _polygon_in_frame(polygon_m: Floats, camera: Camera, view: Floats, far_m: fl
             polygon_m = _cut_polygon(polygon_m, plane, offset)
     if len(polygon_m) < 3:
         return np.empty((0, 2))
-    image = _project(_curve(np.vstack([polygon_m, polygon_m[:1]]), camera), camera)[:-1]
+    image = camera.project(_curve(np.vstack([polygon_m, polygon_m[:1]]), camera))[:-1]
     for plane, offset in _frame_edges(camera):
         if len(image):
             image = _cut_polygon(image, plane, offset)

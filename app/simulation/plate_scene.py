@@ -183,13 +183,7 @@ class PlateScene:
         image = np.full((len(in_camera), 2), np.nan)
         ahead = in_camera[:, 2] > 0.05
         if ahead.any():
-            image[ahead] = cv2.projectPoints(
-                in_camera[ahead],
-                np.zeros(3),
-                np.zeros(3),
-                self.camera.matrix,
-                np.array(self.camera.distortion or [0.0] * 4),
-            )[0][:, 0]
+            image[ahead] = self.camera.project(in_camera[ahead])
         return image
 
 

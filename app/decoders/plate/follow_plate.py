@@ -59,8 +59,7 @@ def predict_corners(pose: PlatePose, geometry: PlateGeometry, camera: Camera, ad
     in_camera = object_m @ pose.rotation.T + pose.translation_m - advance_m * camera.camera_from_vehicle[:, 0]
     if in_camera[:, 2].min() <= geometry.side_mm / 1000:
         return None
-    zero, distortion = np.zeros(3), np.array(camera.distortion or (0.0,) * 4)
-    return np.asarray(cv2.projectPoints(in_camera, zero, zero, camera.matrix, distortion)[0].reshape(-1, 2))
+    return camera.project(in_camera)
 
 
 def is_large_enough(corners_px: Array, known: PlateEvidence) -> bool:

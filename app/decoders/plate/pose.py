@@ -111,9 +111,8 @@ def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeomet
         None when no pose in front of the camera projects to the corners.
     """
     object_m = np.column_stack([geometry.corners_mm / 1000, np.zeros(4)])
-    distortion = np.array(camera.distortion or (0.0,) * 4)
     found, rotations, translations, _ = cv2.solvePnPGeneric(
-        object_m, corners_px.reshape(4, 1, 2), camera.matrix, distortion, flags=cv2.SOLVEPNP_IPPE
+        object_m, camera.undistort(corners_px), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
     if not found:
         return None
@@ -121,7 +120,7 @@ def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeomet
     best: tuple[float, Array, Array] | None = None
     for rotation, translation in zip(rotations, translations, strict=True):
         pose = np.concatenate([rotation.ravel(), translation.ravel()])
-        refined = _refine(pose, corners_px, weight, object_m, camera, distortion)
+        refined = _refine(pose, corners_px, weight, object_m, camera)
         if refined is not None and (best is None or refined[0] < best[0]):
             best = refined
     if best is None:
@@ -129,7 +128,7 @@ def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeomet
     cost, pose, information = best
     # corners that no pose projects to err by more than they report, and so does the pose
     scale = (SCATTER_WEIGHT + cost) / (SCATTER_WEIGHT + REDUNDANT)
-    projected = cv2.projectPoints(object_m, pose[:3], pose[3:], camera.matrix, distortion)[0].reshape(4, 2)
+    projected = cv2.projectPoints(object_m, pose[:3], pose[3:], camera.matrix, camera.lens)[0].reshape(4, 2)
     return PlatePose(
         rotation=np.asarray(cv2.Rodrigues(pose[:3])[0], dtype=float),
         translation_m=pose[3:].copy(),
@@ -149,7 +148,7 @@ def with_pose(reading: PlateReading, camera: Camera | None) -> PlateReading:
 
 
 def _refine(
-    pose: Array, corners_px: Array, weight: Array, object_m: Array, camera: Camera, distortion: Array
+    pose: Array, corners_px: Array, weight: Array, object_m: Array, camera: Camera
 ) -> tuple[float, Array, Array] | None:
     """Gauss-Newton on corners and mount: cost, pose (rotation vector left of the first, translation), information."""
     cost, information = math.inf, np.eye(6)
@@ -158,7 +157,7 @@ def _refine(
         if pose[5] <= MIN_DEPTH_M:
             return None
         in_camera = object_m @ rotation.T
-        projected, jacobian = cv2.projectPoints(in_camera, np.zeros(3), pose[3:], camera.matrix, distortion)
+        projected, jacobian = cv2.projectPoints(in_camera, np.zeros(3), pose[3:], camera.matrix, camera.lens)
         by_pose = jacobian[:, :6]
         residual = corners_px.reshape(8) - projected.reshape(8)
         mount, by_mount, mount_weight = _mount_residual(rotation, pose[3:], camera)
@@ -293,13 +292,12 @@ def locate_moving_plate(
         return pose
     object_m = np.column_stack([geometry.corners_mm / 1000, np.zeros(4)])
     forward = camera.camera_from_vehicle[:, 0]
-    distortion = np.array(camera.distortion or (0.0,) * 4)
     shift = np.zeros((4, 2))
     for _step in range(MAX_SHUTTER_STEPS):
         in_camera = object_m @ pose.rotation.T + pose.translation_m
         # where the vehicle was when the row of a corner was exposed, and so where that corner was seen
         then = in_camera - moved_m[:, None] * forward
-        now, seen = _project(in_camera, camera, distortion), _project(then, camera, distortion)
+        now, seen = camera.project(in_camera), camera.project(then)
         last, shift = shift, now - seen
         if np.abs(shift - last).max() < REST_PX:
             break
@@ -308,8 +306,3 @@ def locate_moving_plate(
             return None
         pose = moved
     return pose
-
-
-def _project(points_m: Array, camera: Camera, distortion: Array) -> Array:
-    zero = np.zeros(3)
-    return np.asarray(cv2.projectPoints(points_m, zero, zero, camera.matrix, distortion)[0].reshape(-1, 2))
