@@ -28,16 +28,17 @@ from app.decoders.plate.normal_equations import (
     substitute,
 )
 from app.decoders.plate.pose import marker_centroids, unit_edges, unit_shapes
-from app.decoders.plate.profiles import NORMAL_TABLE, blur_quadrature
 from app.decoders.plate.synthesis import (
     BLUR,
     FIRST_GAP,
     FIRST_ROAD,
     MOTION,
+    NORMAL_TABLE,
     POSE,
     SINGLES,
     PlateModel,
     PlatePatch,
+    blur_quadrature,
     new_scratch,
 )
 from app.markers.plate import PlateGeometry

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from app.compiled import kernel, loop, routine, step
-from app.decoders.plate.profiles import Quadrature
 from app.decoders.plate.synthesis import (
     FIRST_GAP,
     FIRST_ROAD,
@@ -18,6 +17,7 @@ from app.decoders.plate.synthesis import (
     PixelRow,
     PlateModel,
     PlatePatch,
+    Quadrature,
     Scratch,
     blur_on_plate,
     field_light,

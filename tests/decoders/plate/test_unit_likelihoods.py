@@ -7,8 +7,7 @@ import numpy as np
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, decode_symbols
 from app.decoders.plate.fit import PlateFit
 from app.decoders.plate.pose import unit_edges, unit_shapes
-from app.decoders.plate.profiles import NORMAL_TABLE
-from app.decoders.plate.synthesis import PlateModel
+from app.decoders.plate.synthesis import NORMAL_TABLE, PlateModel
 from app.decoders.plate.unit_likelihoods import unit_log_likelihoods
 from app.markers.plate import PlateCode, PlateGeometry
 from tests.decoders.plate.scenes import PAPER
