@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-DECODER_VERSION = "plate/8"
+DECODER_VERSION = "plate/9"
 PAPER_VERSION = "plate-paper/1"
 """Of `paper.decode_plates_paper`, the paper's own algorithm."""
 Array = npt.NDArray[Any]  # of whatever numbers

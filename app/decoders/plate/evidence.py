@@ -86,6 +86,7 @@ class PlateEvidence:
     agreeing: int = 1  # frames of these whose units are about the same
     # of the code that the units show, where the frame's pixels were compared
     verification: UnitVerification | None = None
+    tries: int = 1  # places of which this is the one that is most like a pattern of the registry
 
 
 def read_evidence(
@@ -162,9 +163,10 @@ def _find_lacking(evidence: PlateEvidence) -> tuple[PlateOutcome, str] | None:
 
 
 def _look_alikes(evidence: PlateEvidence) -> float:
-    """Share of the look-alikes that show as much of a plate's grid and markers."""
+    """Look-alikes over those of one place whose grid and markers show as much of a plate."""
     has_markers = evidence.colours is not None and count_clear(evidence.colours) >= CLEAR_MARKERS
-    return CLEAR_LOOK_ALIKES if has_markers and evidence.explained >= MIN_EXPLAINED_ALONE else 1.0
+    share = CLEAR_LOOK_ALIKES if has_markers and evidence.explained >= MIN_EXPLAINED_ALONE else 1.0
+    return share * evidence.tries
 
 
 def _is_small(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:

@@ -6,6 +6,7 @@ compared with the frame, and the plate is fitted where the two agree best.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -16,7 +17,7 @@ from app.decoders.plate import Array
 from app.decoders.plate.confirm import Expected, with_unseen_damage
 from app.decoders.plate.detect_blobs import difference_signal, half_planes
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
-from app.decoders.plate.fit import PlateFit, fit_plate, project
+from app.decoders.plate.fit import fit_plate, project
 from app.decoders.plate.marker_colours import measure_marker_colours
 from app.decoders.plate.pose import marker_centroids, unit_edges, with_pose
 from app.decoders.plate.unit_likelihoods import unit_log_likelihoods, with_hidden_markers
@@ -137,25 +138,12 @@ def find_expected(image: Array, expected: ExpectedPlate, camera: Camera | None =
     Its units must show the code as those of a registered plate must (`decode_symbols`). No colours are needed, so that
     markers may be covered, mirrored over or too weak to be found.
     """
-    code, geometry = expected.code, expected.geometry
-    fit = _fit_expected(image, expected)
-    units = None if fit is None else unit_log_likelihoods(fit)
-    if fit is None or units is None:
+    corners_px = _most_alike(image, expected)
+    if corners_px is None:
         return None
-    colours = measure_marker_colours(difference_signal(half_planes(image)), fit.plate_from_image, geometry)
-    units = with_hidden_markers(units, colours.tints, geometry.n)
-    extent_px = np.ptp(fit.corners_px, axis=0)
-    evidence = PlateEvidence(
-        units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px, float(extent_px.min()),
-        weakest_marker=float(colours.margins.min()), colours=colours,
-        missing=(PlateOutcome.UNSURE, "found by the plate that another frame shows"),
-    )  # fmt: skip
-    reading = PlateReading(
-        PlateOutcome.UNSURE, fit.corners_px, fit.corners_covariance_px2, geometry=geometry,
-        width_px=float(extent_px[0]), height_px=float(extent_px[1]),
-    )  # fmt: skip
-    reading, _decoded = read_evidence(reading, evidence, (code,))
-    if reading.code is None or reading.code.digits != code.digits:
+    missing = PlateOutcome.UNSURE, "found by the plate that another frame shows"
+    reading, _evidence = read_pattern(image, corners_px, expected.geometry, (expected.code,), missing) or (None, None)
+    if reading is None or reading.code is None or reading.code.digits != expected.code.digits:
         return None
     # the code came from another frame, not from the registry: it is as sure as there
     reading = replace(
@@ -164,17 +152,55 @@ def find_expected(image: Array, expected: ExpectedPlate, camera: Camera | None =
     return with_pose(with_unseen_damage(reading), camera)
 
 
-def _fit_expected(image: Array, expected: ExpectedPlate) -> PlateFit | None:
-    """The plate fitted where the frame is most like its pattern, of the places where it may be."""
+def read_pattern(
+    image: Array,
+    corners_px: Array,
+    geometry: PlateGeometry,
+    codebook: Sequence[PlateCode],
+    missing: tuple[PlateOutcome, str],
+    tries: int = 1,
+) -> tuple[PlateReading, PlateEvidence] | None:
+    """The reading of a plate whose colours need not show, and its evidence; None where nothing is like a plate.
+
+    Parameters
+    ----------
+    corners_px : ndarray, shape (4, 2)
+        Where it may be, to half a unit. [px]
+    codebook : sequence of PlateCode
+        Codes that it may have.
+    missing : tuple of PlateOutcome and str
+        Why its digits do not count where no code of these, and no check, confirms them.
+    tries : int
+        As of `PlateEvidence`.
+    """
+    image_from_plate = cv2.getPerspectiveTransform(_UNIT_SQUARE, corners_px.astype(np.float32))
+    fit = fit_plate(image, project(np.asarray(image_from_plate, float), marker_centroids(geometry)), geometry)
+    units = None if fit is None else unit_log_likelihoods(fit)
+    if fit is None or units is None:
+        return None
+    colours = measure_marker_colours(difference_signal(half_planes(image)), fit.plate_from_image, geometry)
+    units = with_hidden_markers(units, colours.tints, geometry.n)
+    extent_px = np.ptp(fit.corners_px, axis=0)
+    evidence = PlateEvidence(
+        units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px, float(extent_px.min()),
+        weakest_marker=float(colours.margins.min()), colours=colours, missing=missing, tries=tries,
+    )  # fmt: skip
+    reading = PlateReading(
+        PlateOutcome.UNSURE, fit.corners_px, fit.corners_covariance_px2, geometry=geometry,
+        width_px=float(extent_px[0]), height_px=float(extent_px[1]),
+    )  # fmt: skip
+    reading, _decoded = read_evidence(reading, evidence, codebook)
+    return reading, evidence
+
+
+def _most_alike(image: Array, expected: ExpectedPlate) -> Array | None:
+    """Corners where the frame is most like the plate's pattern, of the places where it may be, shape (4, 2). [px]"""
     geometry = expected.geometry
     grey, pattern = _grey(image), _grey_pattern(expected.code, geometry)
     ends = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32) * len(pattern)
     matches = [(*_best_match(grey, pattern, ends, place), place) for place in expected.places_px]
     likeness, shift, place = max(matches, key=lambda match: match[0])
-    if likeness < MIN_EXPECTED_LIKENESS:
-        return None
-    image_from_plate = cv2.getPerspectiveTransform(_UNIT_SQUARE, (place + shift).astype(np.float32))
-    return fit_plate(image, project(np.asarray(image_from_plate, float), marker_centroids(geometry)), geometry)
+    return place + shift if likeness >= MIN_EXPECTED_LIKENESS else None
 
 
 @lru_cache(maxsize=16)

@@ -23,7 +23,9 @@ from app.decoders.plate.detect_quads import MarkerQuad
 from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, find_warm_plates
 from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evidence
 from app.decoders.plate.find_candidates import Candidate, find_candidates
+from app.decoders.plate.find_registered import find_registered
 from app.decoders.plate.fit import PlateFit, finish_fit, fit_coarsely, project, refine_corners
+from app.decoders.plate.follow_plate import read_pattern
 from app.decoders.plate.marker_colours import (
     MIN_MARGIN,
     MarkerColours,
@@ -236,8 +238,19 @@ class FrameReader:
                     plate = self._read_candidate(signal, candidate)
                     found += [plate] if plate else []
             if self._is_clear or any(plate.reading.code for plate in found):
-                break
-        return found
+                return found
+        return [*self._read_registered(), *found]
+
+    def _read_registered(self) -> list[PlateInFrame]:
+        """The plate that is most like one of the registry, where its units confirm it."""
+        if self._camera is None or not self._codebook:
+            return []
+        for geometry, likely in find_registered(self._image, self._camera, self._codebook, self._geometries):
+            missing = PlateOutcome.UNSURE, "found by a pattern of the registry"
+            read = read_pattern(self._image, likely.corners_px, geometry, self._codebook, missing, likely.tries)
+            if read is not None and read[0].code is not None:
+                return [PlateInFrame(with_pose(read[0], self._camera), read[1])]
+        return []
 
     def read_warm(self) -> list[PlateInFrame]:
         """Plates that are warmer or colder than the road in a thermal frame."""

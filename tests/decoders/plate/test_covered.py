@@ -199,3 +199,46 @@ def test_weather_changes_the_plate_or_its_light(name: str) -> None:
     assert (changed > 0.05) == (name != "dusk")
     assert (emission is not None and float(emission.max()) > 0.01) == (name == "wet")
     assert (weather.conditions.night_light is not None) == (name == "dusk")
+
+
+# === Plates that the registry expects, by their patterns.
+
+
+def grey_markers(code: PlateCode = CODE) -> Face:
+    """A plate whose four markers are under snow: nothing of it has a colour."""
+    hidden = [unit for corner in CORNERS for unit in marker_units(corner)]
+    return painted(face_of(code), dict.fromkeys(hidden, SNOW))
+
+
+NEIGHBOURS = tuple(PlateCode.from_registry_number(0xAB000000 + 7919 * number) for number in range(19))
+CORNERS = ("top-left", "top-right", "bottom-right", "bottom-left")
+
+
+@pytest.mark.parametrize("turned_deg", [-15.0, 0.0, 12.0])
+def test_a_registered_plate_without_any_marker_is_read_by_its_pattern(turned_deg: float) -> None:
+    shot = shoot(PlacedFace(grey_markers(), AHEAD_M, rotation_deg=turned_deg))
+    assert not any(reading.digits for reading in decode_plates(shot.image, camera=CAMERA)), "by its colours"
+    [reading] = decode_plates(shot.image, camera=CAMERA, codebook=(*NEIGHBOURS, CODE))
+    assert (reading.digits, reading.is_registered) == (CODE.digits, True)
+    assert reading.pose is not None
+    corners_px = reading.corners_px
+    assert corners_px is not None
+    np.testing.assert_allclose(corners_px, shot.truths[0].corners_px, atol=1.0)
+
+
+def test_it_is_not_taken_for_a_registered_neighbour_of_another_code() -> None:
+    image = shoot(PlacedFace(grey_markers(), AHEAD_M)).image
+    read = [one.digits for one in decode_plates(image, camera=CAMERA, codebook=NEIGHBOURS) if one.code is not None]
+    assert read in ([], [CODE.digits]), "its own checks may confirm it"
+
+
+def test_it_is_not_sought_where_nothing_is_registered_or_the_mount_is_unknown() -> None:
+    image = shoot(PlacedFace(grey_markers(), AHEAD_M)).image
+    for options in ({"camera": CAMERA}, {"codebook": (CODE,)}):
+        assert not any(reading.code for reading in decode_plates(image, **options))
+
+
+def test_a_road_without_a_plate_shows_none_of_the_registry() -> None:
+    for seed in range(3):
+        image = shoot(seed=seed).image
+        assert not any(reading.code for reading in decode_plates(image, camera=CAMERA, codebook=(*NEIGHBOURS, CODE)))
