@@ -27,9 +27,9 @@ LEVELS = 4
 """[images] the frame, and it averaged down to a half, a quarter and an eighth."""
 MIN_UNIT_ROWS = 1.2
 """[px] height of a unit in the image from which on a plate is sought, as `follow_plate.MIN_EXPECTED_UNIT_PX`."""
-NEAREST_M, REACH_ASIDE_M, WIDENING = 0.8, 2.0, 0.15
-"""[m, m, 1] road that is searched: from this distance on; to both sides as far, and farther by this share of the
-distance: the lane, and half of each one beside it."""
+NEAREST_M, FARTHEST_M, REACH_ASIDE_M, WIDENING = 0.8, 12.0, 2.0, 0.15
+"""[m, m, m, 1] road that is searched, from the first distance to the second at most; to both sides as far as the third,
+and farther by this share of the distance: the lane, and half of each one beside it."""
 MAX_PLACES, MIN_BUSY = 5, 0.2
 """[places, log] busiest places that are compared, and how much busier than the road around they are at least."""
 LOG_FLOOR = 16.0
@@ -124,6 +124,8 @@ def find_registered(
     geometries : sequence of PlateGeometry
         That they may have.
     """
+    if not codebook:
+        return
     view = _RoadView(image, camera)
     matches: list[tuple[PlateGeometry, Sequence[PlateCode], _Match]] = []
     for geometry in geometries:
@@ -142,7 +144,7 @@ def _busy_places(view: _RoadView, camera: Camera, geometry: PlateGeometry) -> li
     """Where the road has more edges than around, in both directions: forward and left, shape (2,). [m]"""
     side_m = geometry.side_mm / 1000
     box = round(side_m / ROAD_M)
-    far_m = math.sqrt(camera.fy_px * camera.height_m * side_m / geometry.n / MIN_UNIT_ROWS)
+    far_m = min(math.sqrt(camera.fy_px * camera.height_m * side_m / geometry.n / MIN_UNIT_ROWS), FARTHEST_M)
     found: list[tuple[float, Floats]] = []
     while far_m > 2 * NEAREST_M:
         near_m, aside_m = far_m / 2.3, REACH_ASIDE_M + WIDENING * far_m
@@ -263,4 +265,4 @@ def _pattern(code: PlateCode, samples: int) -> Floats32:
     light = np.kron(1 - 2.0 * code.units, np.ones((samples, samples))).astype(np.float32)
     pattern = cv2.GaussianBlur(light, (0, 0), PATTERN_BLUR * samples).ravel() * used
     pattern -= used * (pattern.sum() / used.sum())
-    return np.asarray(pattern / np.linalg.norm(pattern), np.float32)
+    return np.asarray(pattern / max(float(np.linalg.norm(pattern)), 1e-9), np.float32)  # 0 for a blank face

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.confirm import UnitVerification
+from app.decoders.plate.confirm import UnitVerification, with_expected
 from app.decoders.plate.decode_symbols import DecodedSymbols
 from app.decoders.plate.detect_blobs import MarkerSignal, half_planes
 from app.decoders.plate.detect_quads import MarkerQuad
@@ -113,7 +113,11 @@ def decode_plates(
         The image is not of this type, or not of the camera's size.
     """
     found = read_plates(image, camera=camera, codebook=codebook, thermal=thermal, geometries=geometries)
-    return [reading for reading, _evidence in found]
+    readings = [reading for reading, _evidence in found]
+    if thermal or camera is None or any(reading.code is not None for reading in readings):
+        return readings
+    registered = _read_registered(image, camera, codebook, geometries)
+    return readings if registered is None else with_expected(readings, [registered])
 
 
 def read_plates(
@@ -129,6 +133,18 @@ def read_plates(
     frame = FrameReader(image, camera, codebook, geometries)
     found = frame.read_warm() if thermal else frame.read_coloured()
     return list(_without_overlaps(found))
+
+
+def _read_registered(
+    image: Frame, camera: Camera, codebook: Sequence[PlateCode], geometries: Sequence[PlateGeometry]
+) -> PlateReading | None:
+    """A plate whose colours do not show, where its units are those of a registered one."""
+    for geometry, likely in find_registered(image, camera, codebook, geometries):
+        missing = PlateOutcome.UNSURE, "found by a pattern of the registry"
+        read = read_pattern(image, likely.corners_px, geometry, codebook, missing, likely.tries)
+        if read is not None and read[0].code is not None:
+            return with_pose(read[0], camera)
+    return None
 
 
 def _check(image: Frame, camera: Camera | None, thermal: bool, geometries: Sequence[PlateGeometry]) -> None:
@@ -238,19 +254,8 @@ class FrameReader:
                     plate = self._read_candidate(signal, candidate)
                     found += [plate] if plate else []
             if self._is_clear or any(plate.reading.code for plate in found):
-                return found
-        return [*self._read_registered(), *found]
-
-    def _read_registered(self) -> list[PlateInFrame]:
-        """The plate that is most like one of the registry, where its units confirm it."""
-        if self._camera is None or not self._codebook:
-            return []
-        for geometry, likely in find_registered(self._image, self._camera, self._codebook, self._geometries):
-            missing = PlateOutcome.UNSURE, "found by a pattern of the registry"
-            read = read_pattern(self._image, likely.corners_px, geometry, self._codebook, missing, likely.tries)
-            if read is not None and read[0].code is not None:
-                return [PlateInFrame(with_pose(read[0], self._camera), read[1])]
-        return []
+                break
+        return found
 
     def read_warm(self) -> list[PlateInFrame]:
         """Plates that are warmer or colder than the road in a thermal frame."""
