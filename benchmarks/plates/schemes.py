@@ -109,40 +109,60 @@ def list_drives(seeds: Sequence[int], drives: int, only: Sequence[str]) -> list[
     return [SchemeDrive(name, k, seed) for seed in seeds for name in names for k in range(drives)]
 
 
-def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
-    """Render and read the frames of a drive with every scheme and every tag."""
-    cv2.setNumThreads(1)
+@dataclass(frozen=True, slots=True)
+class DrawnDrive:
+    """The scenes of a drive, to be rendered with any plate."""
+
+    weather: Weather
+    stains: int  # seed of the wear of each face
+    places: list[tuple[float, float, int]]  # as `draw_places`
+    views: list[tuple[PlateScene, np.ndarray]]
+    noise: list[int]  # seed of each frame
+
+    def frames(self, face: Face) -> Iterator[tuple[PlateScene, np.ndarray]]:
+        """Scene and image of each frame."""
+        for (scene, background), seed in zip(self.views, self.noise, strict=True):
+            covered = replace(scene.faces[0], face=self.weather.on_face(face))
+            placed = self.weather.in_scene(replace(scene, faces=(covered, *scene.faces[1:])))
+            road = self.weather.on_road(placed, background)
+            yield placed, render_plate_scene(placed, road, np.random.default_rng(seed)).image
+
+    def plate(self, candidate: Candidate) -> tuple[Face, list[PlateCode]]:
+        """Face of a plate, and the codes of it and of its neighbours."""
+        codes = [candidate.code(*place) for place in self.places]
+        conditions, rng = self.weather.conditions, np.random.default_rng(self.stains)
+        return plate_face(codes[0], candidate.geometry, conditions.look, conditions.wear, rng), codes
+
+
+def draw_drive(drive: SchemeDrive) -> DrawnDrive:
+    """The scenes of a drive."""
     rng = np.random.default_rng([drive.seed, 7, SCHEME_SETS.index(drive.set_name), drive.index])
-    under_stress = drive.set_name == "stress"
     weather = _draw_weather(drive.set_name, rng)
     conditions = weather.conditions
     stains = int(rng.integers(1 << 31))
     places = draw_places(rng)
     blank = Face(PlateGeometry().side_mm / 1000, np.zeros((2, 2, 3), np.float32))
-    if under_stress:
+    if drive.set_name == "stress":
         views = draw_stress_views(blank, conditions, rng)
     else:
         scenes = [replace(s, night_light=conditions.night_light) for s in draw_scenes(blank, conditions, rng)]
         background = draw_background(scenes[0].camera, rng)
         views = [(scene, background) for scene in scenes]
-    noise = [int(s) for s in rng.integers(1 << 31, size=len(views))]
+    return DrawnDrive(weather, stains, places, views, [int(s) for s in rng.integers(1 << 31, size=len(views))])
 
-    def frames(face: Face) -> Iterator[tuple[PlateScene, np.ndarray]]:
-        for (scene, background), seed in zip(views, noise, strict=True):
-            covered = replace(scene.faces[0], face=weather.on_face(face))
-            placed = weather.in_scene(replace(scene, faces=(covered, *scene.faces[1:])))
-            road = weather.on_road(placed, background)
-            yield placed, render_plate_scene(placed, road, np.random.default_rng(seed)).image
 
+def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
+    """Render and read the frames of a drive with every scheme and every tag."""
+    cv2.setNumThreads(1)
+    drawn = draw_drive(drive)
     records = []
     for candidate in CANDIDATES:
-        codes = [candidate.code(*place) for place in places]
-        face = plate_face(codes[0], candidate.geometry, conditions.look, conditions.wear, np.random.default_rng(stains))
-        records.append(_read(drive, candidate.name, frames(face), codes))
+        face, codes = drawn.plate(candidate)
+        records.append(_read(drive, candidate.name, drawn.frames(face), codes))
     for family in FAMILIES:
-        tag = int(np.random.default_rng([stains, family.modules]).integers(50))
-        face = tag_face(family, tag, conditions, np.random.default_rng(stains))
-        hits = [reads_tag(family, tag, image, face_truth(scene, scene.faces[0])) for scene, image in frames(face)]
+        tag = int(np.random.default_rng([drawn.stains, family.modules]).integers(50))
+        face = tag_face(family, tag, drawn.weather.conditions, np.random.default_rng(drawn.stains))
+        hits = [reads_tag(family, tag, image, face_truth(scene, scene.faces[0])) for scene, image in drawn.frames(face)]
         records.append(SchemeRecord(drive, family.name, len(hits), Counts(sum(hits)), is_tag=True))
     return records
 

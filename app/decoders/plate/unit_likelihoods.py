@@ -112,8 +112,8 @@ MIN_OF_A_LEVEL = 6
 """[units] light or dark ones from which on their median is the usual residual."""
 RISK_CONSTANT, RISK_OF_LEVEL, RISK_OF_MISFIT, RISK_BESIDE_HIDDEN = -0.765, 1.98, 1.877, 2.289
 """[log odds] that a cell shows another symbol than was built: alone, for the logarithms of its level residual and of
-its pixels' misfit, and beside a marker that is hidden. Source: logistic regression over 9,570 cells of `id` and
-`position-robust` plates in weather, shade, glare, stains and wear (decision record 0008)."""
+its pixels' misfit, and beside a marker that is hidden. Source: `python -m benchmarks.training.cell_risk`, 9,570 cells
+(decision record 0008)."""
 RISK_FLOOR = 0.05
 """[contrast] added to a level residual before its logarithm."""
 HIDDEN_TINT, HIDDEN_TINT_SPREAD = 0.3, 0.08
@@ -249,7 +249,6 @@ def _under_veil(fit: PlateFit, levels: LightLevels, veil: Veil) -> UnitEvidence 
     misfit = np.sqrt(fit.unit_misfit.reshape(-1)[unit_index(n).reshape(-1)])
     outlier_ratio = _worst_misfit(misfit, levels.values, dark) * min(1.0, fit.unit_px / STAIN_UNIT_PX)
     damage = float(level_residual.max()) * outlier_ratio
-    worst = (misfit / max(_median(misfit), 1e-9)).reshape(-1, 4).max(axis=1)
     level_residual *= max(1.0, _blur_units(fit) * MAX_LEVEL_RESIDUAL / MAX_RESIDUAL_SPREAD)
     return UnitEvidence(
         cell_costs=costs - costs.min(axis=1, keepdims=True),
@@ -266,8 +265,15 @@ def _under_veil(fit: PlateFit, levels: LightLevels, veil: Veil) -> UnitEvidence 
         gap=(fit.gap - float(veil.light.mean())) / veil.level,
         span=levels.light - levels.dark,
         veils=(veil,),
-        risk_log_odds=_risk_log_odds(level_residual, worst),
+        risk_log_odds=_risk_log_odds(level_residual, cell_misfits(fit)),
     )
+
+
+def cell_misfits(fit: PlateFit) -> Array:
+    """Residual of the pixels of each cell's worst unit over the median of all units, shape (cells,)."""
+    misfit = np.sqrt(fit.unit_misfit.reshape(-1)[unit_index(fit.units.shape[0]).reshape(-1)])
+    worst: Array = (misfit / max(_median(misfit), 1e-9)).reshape(-1, 4).max(axis=1)
+    return worst
 
 
 def _risk_log_odds(level_residual: Array, misfit_ratio: Array) -> Array:
@@ -275,10 +281,8 @@ def _risk_log_odds(level_residual: Array, misfit_ratio: Array) -> Array:
 
     Parameters
     ----------
-    level_residual : ndarray, shape (cells,)
-        As of `UnitEvidence`.
-    misfit_ratio : ndarray, shape (cells,)
-        Residual of the pixels of each cell's worst unit over the median of all units.
+    level_residual, misfit_ratio : ndarray, shape (cells,)
+        As of `UnitEvidence`, and as `cell_misfits`.
     """
     by_level = RISK_OF_LEVEL * np.log(np.abs(level_residual) + RISK_FLOOR)
     risk: Array = RISK_CONSTANT + by_level + RISK_OF_MISFIT * np.log(np.maximum(misfit_ratio, 1.0))
@@ -295,9 +299,15 @@ def with_hidden_markers(evidence: UnitEvidence, tints: Array, n: int) -> UnitEvi
     n : int
         Units along a side.
     """
+    risk = evidence.risk_log_odds + RISK_BESIDE_HIDDEN * hidden_beside(tints, n)
+    return replace(evidence, risk_log_odds=risk)
+
+
+def hidden_beside(tints: Array, n: int) -> Array:
+    """Probability that each cell lies beside a marker that is hidden, shape (cells,); arguments as above."""
     hidden = 1 / (1 + np.exp(np.clip((tints - HIDDEN_TINT) / HIDDEN_TINT_SPREAD, -30, 30)))
-    beside = (hidden * _beside_markers(n)).max(axis=1)
-    return replace(evidence, risk_log_odds=evidence.risk_log_odds + RISK_BESIDE_HIDDEN * beside)
+    beside: Array = (hidden * _beside_markers(n)).max(axis=1)
+    return beside
 
 
 @lru_cache
