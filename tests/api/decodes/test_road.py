@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -17,11 +18,12 @@ from app.geodesy import enu_from_heading, enu_from_wgs84, move_to_epoch, wgs84_f
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, decimal_codes
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
-from app.simulation.plate_face import PlateWear, draw_look, plate_face
+from app.simulation.plate_face import Face, PlateWear, draw_look, plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene
 from tests.api.decodes.conftest import post_frame
 from tests.api.decodes.test_archives import wait_for
 from tests.conftest import LiveServer, Place
+from tests.decoders.plate.scenes import marker_units, painted
 
 CAMERA = Camera.from_field_of_view(1920, 1080, 70.0, height_m=1.57, depression_deg=23.0, forward_m=1.2, left_m=0.1)
 CAMERA_IN = {
@@ -78,17 +80,20 @@ class Road:
             self.markers.append(answer.json())
         return self
 
-    def frame(self, codes: list[PlateCode] | None = None, seed: int = 1) -> bytes:
-        """JPEG of the plates as the camera sees them."""
+    def frame(
+        self, codes: list[PlateCode] | None = None, seed: int = 1, cover: Callable[[Face], Face] = lambda face: face
+    ) -> bytes:
+        """JPEG of the plates, each covered by something, as the camera sees them."""
         rng = np.random.default_rng(seed)
         codes = codes or [
             PlateCode(m["code"]["digits"], PlateScheme(m["code"]["scheme"]), m["geometry"]["n"]) for m in self.markers
         ]
         faces = tuple(
             PlacedFace(
-                plate_face(code, PlateGeometry(n=code.n), draw_look(rng), PlateWear(), rng), ahead, left, rotation
+                cover(plate_face(code, PlateGeometry(n=code.n), draw_look(rng), PlateWear(), rng)),
+                *where,
             )
-            for code, (ahead, left, rotation) in zip(codes, self.plates, strict=True)
+            for code, where in zip(codes, self.plates, strict=True)
         )
         jpeg = render_plate_scene(PlateScene(camera=CAMERA, faces=faces), None, rng).jpeg
         assert jpeg
@@ -129,6 +134,20 @@ def test_the_vehicle_is_found(real_client: httpx.Client, place: Place) -> None:
     assert covariance.shape == (4, 4)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
     assert road.error_m(fix) < 5 * np.sqrt(np.trace(covariance[:3, :3]))
+
+
+def test_a_plate_whose_markers_are_under_snow_finds_the_vehicle(real_client: httpx.Client, place: Place) -> None:
+    """No colour of it shows: it is found by its pattern, which only the registry can name."""
+    corners = ("top-left", "top-right", "bottom-right", "bottom-left")
+    snow = dict.fromkeys((unit for corner in corners for unit in marker_units(corner)), (0.88, 0.86, 0.83))
+    road = Road(real_client, place(), (5.0, 0.4, 8.0)).register()
+    frame = road.frame(cover=lambda face: painted(face, snow))
+    decode = post_frame(real_client, frame, road.context()).json()
+    [reading] = [r for r in decode["readings"] if r["outcome"] == "read"]
+    assert reading["match"]["marker_id"] == road.markers[0]["id"]
+    assert road.error_m(decode["fix"]) < 0.1
+    elsewhere = road.context(coarse_position={"lon_deg": 20.0, "lat_deg": 20.0, "accuracy_m": 10.0})
+    assert post_frame(real_client, frame, elsewhere).json()["summary"]["plates_read"] == 0, "no registry, no pattern"
 
 
 def test_several_plates_are_fused(real_client: httpx.Client, place: Place) -> None:
