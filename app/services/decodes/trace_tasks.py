@@ -90,10 +90,13 @@ def decode_recording(
         content = read_trace({name: stream}, declared, limits)
     loaded = time.perf_counter()
     trace, report = content.trace, content.report
-    findings, version = find_magnets(trace, declared, tags, formats, depth_m)
-    if declared.method == "matched":
+    checked, version = find_magnets(trace, declared, tags, formats, depth_m)
+    findings = checked.findings
+    for mistake in checked.faults:
+        report.warn(mistake.text)
+    if declared.method == "matched" and not checked.is_refused:
         bar = bar_above(declared.sensors, depth_m)
-        for mistake in find_mistakes(trace, bar, findings, depth_m=depth_m or 0.0):
+        for mistake in find_mistakes(checked.trace, bar, findings, depth_m=depth_m or 0.0):
             report.warn(mistake.text)
     report.load_ms, report.decode_ms = 1e3 * (loaded - began), 1e3 * (time.perf_counter() - loaded)
     speed = np.interp(trace.t_s, trace.speed_t_s, trace.speed_m_s)
