@@ -80,7 +80,8 @@ def draw_road_drive(
     if iron == "town":
         clutter = town_clutter(lead_m, length_m, rng)
     elif iron == "joints":
-        clutter = [Clutter(str(rng.choice(("slab joint", "bridge joint"))), float(x), 0.0) for x in np.arange(lead_m, length_m, float(rng.uniform(6, 15)))]
+        kinds, joint_m = ("slab joint", "bridge joint"), float(rng.uniform(6, 15))
+        clutter = [Clutter(str(rng.choice(kinds)), float(at), 0.0) for at in np.arange(lead_m, length_m, joint_m)]
     elif iron:
         clutter = ferrous_clutter(lead_m + 5, length_m, 20, rng)
     vehicle = replace(draw_vehicle(rng, float(rng.choice(clearances_m))), bar=bar)
@@ -243,9 +244,7 @@ class FaultTally:
     other: int = 0  # corrected under another name
     unseen: int = 0  # neither, and a reading at 0.95 is wrong
 
-    def add(
-        self, drive: SimulatedDrive, fault: Fault | None, name: str = "", bar: MagnetometerBar = BAR
-    ) -> None:
+    def add(self, drive: SimulatedDrive, fault: Fault | None, name: str = "", bar: MagnetometerBar = BAR) -> None:
         """Decode a drive without and with the check of its bar."""
         candidates = TagCandidates(formats=[FORMAT])
         checked = decode_checked(drive.trace, bar, candidates=candidates)

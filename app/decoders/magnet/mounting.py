@@ -1,12 +1,12 @@
 """Whether a bar is mounted as declared: faults are compared by how well dipoles explain what the bar passes.
 
-A magnet is a dipole, and so is much of the iron in a road. In the right mounting a dipole explains the field of an event
-but for the errors of the sensors, in a wrong one it does not, wherever the dipole is and wherever its moment points. So a
-fault is likely where events that are no dipoles as declared become dipoles with the fault. What is no dipole in either,
-like merged magnets and large iron, says nothing, and neither does a sensor beyond the reach of all events.
+A magnet is a dipole, and so is much of the iron in a road. In the right mounting a dipole explains the field of an
+event but for the errors of the sensors, in a wrong one it does not, wherever the dipole is and its moment points. So a
+fault is likely where events that are no dipoles as declared become dipoles with it. What is no dipole in either, like
+merged magnets and large iron, says nothing, and neither does the absence of a field.
 
-A dipole cannot show everything: all signs inverted is a dipole of the other polarity, and left and right exchanged with y
-inverted a mirrored road. The earth's field while the vehicle turns, with its headings, shows which it is.
+A dipole cannot show everything: all signs inverted is a dipole of the other polarity, and left and right exchanged with
+y inverted a mirrored road. The earth's field while the vehicle turns, with its headings, shows which it is.
 
 Shapes: K bins along the road, S sensors, A array sensors.
 """
@@ -45,11 +45,15 @@ HALF_WIDTH_M = 0.7
 """Road on each side of an event. [m] Over two heights of METRO's clearances."""
 LAG_M = 0.6
 """Distance of the places with which the field is compared to find events. [m]"""
-EVENTS_PER_SENSOR = 3
-"""Strongest events by the array sensor that sees most of them, so that each sensor is seen as well as it can be."""
+EVENTS_PER_SENSOR = 4
+"""Strongest events of those that each sensor of the array sees best, and those that each reference sees best: what it
+sees of magnets shows that it is none."""
 QUIET_SHARE, QUIET_CHI2 = 0.2, 7.0
 """Share of the road that shows the noise, and that quantile of chi-squared with 11 degrees of freedom: 14 means of 10 cm
 less a parabola."""
+LOUD_SHARE, LOUD_CHI2, REFERENCE_NOISE = 0.75, 13.7, 1.5
+"""The same for reference sensors, and factor of their noise: that of a wheel, which is no dipole in the road, is louder at
+some parts of a turn than at others."""
 MIN_BINS = 9
 """Bins of an event, at least: those that METRO has at 50 m/s."""
 STARTS_M = (0.16, 0.35)
@@ -60,18 +64,22 @@ SPIKE_UT = 20.0
 """Deviation of one sensor from the samples before and after that is a fault, if fewer than three sensors have it."""
 
 MODEL_SHARE = 0.01
-"""Share of an event's energy that a dipole leaves in the right mounting. Source: gains of 2 %, axes that are 1.5 degrees
-off (data sheet of the MLX90393) and read one after the other leave 0.001 to 0.03 in simulated drives."""
+"""Share of an event's energy that a dipole leaves in the right mounting. Source: gains of 2 %, axes that are 1.5
+degrees off (data sheet of the MLX90393) and read one after the other leave 0.001 to 0.03 in simulated drives."""
 HALF_DEGREES = 4.0
 """Half of the degrees of freedom of an event. Errors of a model are alike in neighbouring samples: so few."""
 MOST = 10.0
 """Log odds of one event, at most."""
+MAX_SHARE = 0.15
+"""Largest share of an event's energy that a dipole leaves which explains it."""
 SURE, MIN_SUPPORT, SUPPORTS = 20.0, 3, 2.5
 """Log odds by which a fault must be likelier than the declared mounting, events that must support it, and log odds of
 an event that does. Source: `python -m benchmarks.magnets bars`: at most 8 on healthy bars."""
+DOUBTFUL = 12.0
+"""Log odds of a fault of the whole bar from which on no magnets are reported."""
 DISTINCT = 8.0
 """Log odds by which a fault must be likelier than any other, to be corrected."""
-FIRST_EVENTS, FIRST_ODDS = 3, 2.0
+FIRST_EVENTS, FIRST_ODDS = 4, 2.0
 """Strongest events that a fault is tried on first, and log odds with which it is tried on all. For speed."""
 SEEN_SHARE = 0.15
 """Share of an event's energy that a sensor must see for its faults to be tried."""
@@ -101,12 +109,13 @@ class Event:
     s_m: Floats  # shape (K,): [m] along the road
     field_ut: Floats  # shape (K, S, 3)
     noise_ut: Floats  # shape (S, 3): of a bin
+    wheel_noise_ut: Floats  # shape (S, 3): of a bin of a reference
     crab_rad: float  # from the vehicle's heading to the direction in which the bar moves, to the left
     curvature: float  # [1/m] of the road, by the headings
 
 
 def find_events(trace: MagnetTrace, bar: MagnetometerBar) -> list[Event]:
-    """The strongest events that each array sensor sees, strongest first."""
+    """The strongest events by the sensor that sees most of them, strongest first."""
     odometer = odometer_m(trace)
     starts = np.flatnonzero(np.diff((odometer / (2 * BIN_M)).astype(int), prepend=-1))
     counts = np.diff(starts, append=len(odometer))
@@ -116,43 +125,55 @@ def find_events(trace: MagnetTrace, bar: MagnetometerBar) -> list[Event]:
     flat = np.nan_to_num(trace.field_ut.reshape(len(odometer), -1))
     mean = (np.add.reduceat(flat, starts, axis=0) / counts[:, None]).reshape(len(starts), -1, 3)
     change = mean[lag:-lag] - (mean[: -2 * lag] + mean[2 * lag :]) / 2
-    noise = _quiet_noise(mean, bar)
-    each = ((change / noise)[:, bar.array] ** 2).sum(axis=2)
+    quiet, loud = _noise(mean, bar)
+    each = ((change / quiet) ** 2).sum(axis=2)
     each = np.median(np.stack([each[:-2], each[1:-1], each[2:]]), axis=0)  # without spikes
-    energy = each.sum(axis=1)
+    energy = each[:, bar.array].sum(axis=1)
     highest = np.max([np.roll(energy, k) for k in range(1 - lag, lag)], axis=0)
     peaks = np.flatnonzero(energy == highest)
     peaks = peaks[np.argsort(-energy[peaks], kind="stable")]
-    loudest = np.argmax(each[peaks], axis=1)
-    rank = np.empty(len(peaks), int)
-    for sensor in range(len(bar.array)):
-        rank[loudest == sensor] = np.arange((loudest == sensor).sum())
-    sample_noise = noise / math.sqrt(float(np.mean(1 / counts)))
+    loudest = bar.array[np.argmax(each[peaks][:, bar.array], axis=1)]
+    chosen = np.zeros(len(peaks), bool)
+    for sensor in bar.array:
+        chosen[np.flatnonzero(loudest == sensor)[:EVENTS_PER_SENSOR]] = True
+    for sensor in bar.references:
+        chosen[np.argsort(-each[peaks, sensor], kind="stable")[:EVENTS_PER_SENSOR]] = True
+    mean_of = math.sqrt(float(np.mean(1 / counts)))
     found = (
-        _cut_event(trace, bar, odometer, float(odometer[starts[p + lag + 1]]) + BIN_M, sample_noise)
-        for p in peaks[rank < EVENTS_PER_SENSOR]
+        _cut_event(
+            trace, bar, odometer, float(odometer[starts[peak + lag + 1]]) + BIN_M, quiet / mean_of, loud / mean_of
+        )
+        for peak in peaks[chosen]
     )
     return [event for event in found if event is not None]
 
 
-def _quiet_noise(mean: Floats, bar: MagnetometerBar) -> Floats:
-    """Standard deviation of each channel (S, 3) in the quietest fifth of the road, of means (N, S, 3) of 10 cm."""
+def _noise(mean: Floats, bar: MagnetometerBar) -> tuple[Floats, Floats]:
+    """Noise of each channel (S, 3) as a sensor of the array and as a reference, of means (N, S, 3) of 10 cm."""
     size = round(HALF_WIDTH_M / BIN_M)
     blocks = mean[: len(mean) // size * size].reshape(-1, size, mean[0].size)
     blocks = blocks - blocks.mean(axis=1, keepdims=True)
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
     left = (blocks**2).sum(axis=1) - (np.einsum("kq,bkc->bqc", basis, blocks) ** 2).sum(axis=1)
-    variance = np.quantile(left, QUIET_SHARE, axis=0) / QUIET_CHI2
-    noise: Floats = np.sqrt(np.maximum(variance, 1e-6)).reshape(-1, 3)
-    return np.maximum(noise, np.median(noise[bar.array], axis=0) / 4)
+    quiet, loud = (
+        np.sqrt(np.maximum(np.quantile(left, share, axis=0) / chi2, 1e-6)).reshape(-1, 3)
+        for share, chi2 in ((QUIET_SHARE, QUIET_CHI2), (LOUD_SHARE, LOUD_CHI2))
+    )
+    quiet = np.maximum(quiet, np.median(quiet[bar.array], axis=0) / 4)
+    return quiet, REFERENCE_NOISE * np.maximum(loud, quiet)
 
 
 def _cut_event(
-    trace: MagnetTrace, bar: MagnetometerBar, odometer: Floats, middle_m: float, noise_ut: Floats
+    trace: MagnetTrace,
+    bar: MagnetometerBar,
+    odometer: Floats,
+    middle_m: float,
+    noise_ut: Floats,
+    wheel_noise_ut: Floats,
 ) -> Event | None:
-    """The field about a place, of a noise per sample; None where it is not whole."""
+    """The field about a place, with noises per sample; None where it is not whole."""
     low, high = (int(k) for k in np.searchsorted(odometer, (middle_m - HALF_WIDTH_M, middle_m + HALF_WIDTH_M)))
-    field = trace.field_ut[low:high].astype(float)
+    field = trace.field_ut[low:high]
     if high - low < MIN_BINS or not np.isfinite(field).all():
         return None
     s = odometer[low:high] - middle_m
@@ -172,6 +193,7 @@ def _cut_event(
         np.add.reduceat(s, starts) / counts,
         np.add.reduceat(without_spikes(field), starts, axis=0) / counts[:, None, None],
         noise_ut * math.sqrt(float(np.mean(1 / counts))),
+        wheel_noise_ut * math.sqrt(float(np.mean(1 / counts))),
         math.atan(forward_m * turned / length_m),
         abs(turned) / length_m,
     )
@@ -183,9 +205,9 @@ def odometer_m(trace: MagnetTrace) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.diff(trace.t_s) * (speed[1:] + speed[:-1]) / 2)])
 
 
-def without_spikes(field_ut: Floats) -> Floats:
+def without_spikes(field_ut: npt.NDArray[np.floating]) -> Floats:
     """Samples (N, S, 3) with spikes of single sensors replaced."""
-    field = field_ut.copy()
+    field: Floats = field_ut.astype(float)
     middle = np.median(np.stack([field[:-2], field[1:-1], field[2:]]), axis=0)
     off = np.abs(field[1:-1] - middle).max(axis=2)
     alone = off > SPIKE_UT + np.sort(off, axis=1)[:, -3:-2]
@@ -226,7 +248,7 @@ class _Family:
     members: tuple[_Hypothesis, ...]
     sensors: tuple[int, ...] = ()  # that differ, counted from 0; none where all do
     left_out: int | None = None  # sensor whose field is predicted by a dipole that is fitted to all others
-    compared: Indices | None = None  # channels to which the dipole is fitted, where it predicts the others'
+    references: tuple[int, ...] = ()  # channels that are references as declared or with the fault
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,12 +257,16 @@ class _Misfit:
 
     share: float  # of the energy that it leaves, beyond the noise
     floor: float  # share that it may leave by errors of the model and chance
-    by_sensor: Floats  # shape (A,): share of each sensor in the energy
+    by_sensor: Floats  # shape (A,), or (S,) with references: share of each sensor in the energy
 
     def odds_of(self, other: _Misfit) -> float:
-        """Log odds of another mounting's misfit: Gaussian errors in proportion to the field, of unknown size."""
+        """Log odds of another mounting's misfit: Gaussian errors in proportion to the field, of unknown size.
+
+        An event speaks for another mounting only if it is a dipole there.
+        """
         floor = max(self.floor, other.floor)
-        return float(np.clip(HALF_DEGREES * math.log((self.share + floor) / (other.share + floor)), -MOST, MOST))
+        odds = float(np.clip(HALF_DEGREES * math.log((self.share + floor) / (other.share + floor)), -MOST, MOST))
+        return odds if other.share < MAX_SHARE else min(odds, 0.0)
 
     @property
     def may_gain(self) -> bool:
@@ -262,10 +288,11 @@ def fit_any_dipole(data: FitData, seen: FitData, start: Floats, prior: MagnetPri
     model = np.empty(seen.field.shape)
     dipole_field(dipole, seen, model)
     remove_background(model, seen.basis, seen.common_share)
-    out = np.zeros((model.shape[0], 3, 3))
-    for j in range(model.shape[0]):
-        for axis in range(3):
-            for k in range(model.shape[2]):
+    sensors, axes, bins = seen.field.shape
+    out = np.zeros((sensors, axes, 3))
+    for j in range(sensors):
+        for axis in range(axes):
+            for k in range(bins):
                 one, two = seen.field[j, axis, k], model[j, axis, k]
                 out[j, axis, 0] += one * one
                 out[j, axis, 1] += two * two
@@ -283,20 +310,19 @@ class MountingModel:
             j: self.array[np.argsort(abs(bar.positions_m[self.array, 1] - bar.positions_m[j, 1]), kind="stable")[:3]]
             for j in self.array.tolist()
         }
-        self._known: dict[bytes, list[_Misfit]] = {}
+        self._known: dict[tuple[int, ...], list[_Misfit]] = {}
 
-    def declared(self, compared: Indices | None = None) -> list[_Misfit]:
+    def declared(self, references: tuple[int, ...] = ()) -> list[_Misfit]:
         """Misfits of all events in the declared mounting."""
-        key = b"" if compared is None else compared.tobytes()
-        if key not in self._known:
+        if references not in self._known:
             same = Mounting.declared(self.bar.sensor_count)
-            self._known[key] = [self.misfit(one, same, compared) for one in self.events]
-        return self._known[key]
+            self._known[references] = [self.misfit(one, same, references) for one in self.events]
+        return self._known[references]
 
     def misfits(self, event: Event, family: _Family) -> list[_Misfit]:
         """How dipoles explain an event with each of the faults of a family."""
         if family.left_out is None:
-            return [self.misfit(event, one.mounting, family.compared) for one in family.members]
+            return [self.misfit(event, one.mounting, family.references) for one in family.members]
         same = Mounting.declared(self.bar.sensor_count)
         others = self.array[self.array != family.left_out]
         figures, chance = self._explain(event, same, self.array, others)
@@ -309,28 +335,31 @@ class MountingModel:
             shown.append(_judge(figures, apart + float(own.sum()), chance))
         return shown
 
-    def misfit(self, event: Event, mounting: Mounting, compared: Indices | None = None) -> _Misfit:
-        """How the best dipole explains an event; by all sensors, where channels are compared."""
-        if compared is None:
-            figures, chance = self._explain(event, mounting, self.array, self.array)
-        else:
-            sensors = np.arange(self.bar.sensor_count)
-            figures, chance = self._explain(event, mounting, sensors, sensors[np.isin(mounting.channels, compared)])
+    def misfit(self, event: Event, mounting: Mounting, references: tuple[int, ...] = ()) -> _Misfit:
+        """How the best dipole explains an event."""
+        sensors = np.arange(self.bar.sensor_count) if references else self.array
+        figures, chance = self._explain(event, mounting, sensors, sensors, references)
         return _judge(figures, _left(figures), chance)
 
     def _explain(
-        self, event: Event, mounting: Mounting, sensors: Indices, fitted: Indices
+        self, event: Event, mounting: Mounting, sensors: Indices, fitted: Indices, references: tuple[int, ...] = ()
     ) -> tuple[Floats, int]:
         """What the best dipole shows at sensors, fitted to some of them, and their degrees of freedom."""
         c, n = math.cos(mounting.yaw_rad - event.crab_rad), math.sin(mounting.yaw_rad - event.crab_rad)
         turn = np.array([[c, -n, 0.0], [n, c, 0.0], [0.0, 0.0, 1.0]])
         places, channels = self._positions_m[sensors] @ turn.T, mounting.channels[sensors]
         field = (event.field_ut[:, channels] * mounting.signs[sensors]) @ turn.T
-        noise = np.sqrt(event.noise_ut[channels] ** 2 @ (turn**2).T)
+        is_reference = np.isin(channels, references)[:, None]
+        noise_ut = np.where(is_reference, event.wheel_noise_ut[channels], event.noise_ut[channels])
+        noise = np.sqrt(noise_ut**2 @ (turn**2).T)
         bins = len(event.s_m)
         noise *= math.sqrt((event.s_m[-1] - event.s_m[0]) / (bins - 1) / BIN_M)  # as `whiten` takes it
         samples = Samples(
-            event.s_m, np.ascontiguousarray(field.transpose(1, 2, 0)), np.ones((len(sensors), bins)), 1 / noise, _NOTHING
+            event.s_m,
+            np.ascontiguousarray(field.transpose(1, 2, 0)),
+            np.ones((len(sensors), bins)),
+            1 / noise,
+            _NOTHING,
         )
         white, weight, basis = whiten(samples, 0, bins, _ONES, np.zeros((bins, len(sensors), 3), np.float32), 2)
         seen = FitData(event.s_m, white, weight, np.zeros((3, bins)), places, basis, _NOTHING)
@@ -368,7 +397,8 @@ def _judge(figures: Floats, left: float, chance: int) -> _Misfit:
     energy = figures[:, :, 0].sum(axis=1)
     signal = max(float(energy.sum()) - chance, 1.0)
     floor = MODEL_SHARE + 2 * math.sqrt(2 * chance) / signal
-    return _Misfit(min(max(left - chance, 0.0) / signal, 1.0), floor, energy / max(energy.sum(), 1e-12))
+    share = min(max(left - chance, 0.0) / signal, 1.0)
+    return _Misfit(share, floor, energy / max(float(energy.sum()), 1e-12))
 
 
 # === The search.
@@ -391,7 +421,7 @@ def check_mounting(trace: MagnetTrace, bar: MagnetometerBar) -> MountingCheck:
     if sum(one.may_gain for one in model.declared()) < MIN_SUPPORT:
         return MountingCheck(declared)
     found = sorted(likely_faults(model, trace), key=lambda one: -one[0])
-    if not found or found[0][0] < SURE:
+    if not found or found[0][0] < (SURE if found[0][2].sensors else DOUBTFUL):
         return MountingCheck(declared)
     # what was left off early may be as likely as what was found
     whole = [one for family in _families(model, trace) if not family.sensors for one in _judged(model, family, True)]
@@ -400,7 +430,7 @@ def check_mounting(trace: MagnetTrace, bar: MagnetometerBar) -> MountingCheck:
     rivals = [one for one in found[1:] if one[0] > odds - DISTINCT]
     if family.left_out is not None and rivals and all(other is family for _, _, other in rivals):
         return _without_sensor(best, family.left_out, bar)
-    if rivals:
+    if rivals or odds < SURE:
         names = dict.fromkeys(name for _, one, _ in (found[0], *rivals) for name in _names(one))
         fault = LikelyMistake("bar.sensors", "; or ".join(names), "check the order and axes of all sensors")
         return MountingCheck(None, (fault,))
@@ -425,7 +455,7 @@ def _judged(model: MountingModel, family: _Family, whole: bool = False) -> Itera
     found = [(one, member, family) for one, member in zip(odds, family.members, strict=True) if one > 0]
     if found and family.members[0].mounting.yaw_rad:  # rotations that are near each other are no rivals
         best = max(found, key=lambda one: one[0])
-        yield best if best[0] < SURE - DISTINCT else _refined(model, *best)
+        yield best if best[0] < DOUBTFUL else _refined(model, *best)
     else:
         yield from found
 
@@ -433,7 +463,7 @@ def _judged(model: MountingModel, family: _Family, whole: bool = False) -> Itera
 def _log_odds(model: MountingModel, family: _Family, whole: bool = False) -> list[float]:
     """Log odds of each fault of a family against the declared mounting; 0 where they are low."""
     none = [0.0] * len(family.members)
-    declared = model.declared(family.compared)
+    declared = model.declared(family.references)
     turned = bool(family.members[0].mounting.yaw_rad)
     usable = [k for k, event in enumerate(model.events) if not turned or event.curvature < MAX_CURVATURE]
     weights = {k: _seen_share(declared[k], family, model) for k in usable}
@@ -442,11 +472,12 @@ def _log_odds(model: MountingModel, family: _Family, whole: bool = False) -> lis
         return none
     may_gain.sort(key=lambda k: -weights[k])
     others = [k for k in usable if k not in may_gain and weights[k] > SEEN_SHARE]
+    first = len(may_gain) if family.references else FIRST_EVENTS  # few events show which sensors are references
     rows: list[list[float]] = []
     for k in (*may_gain, *others):
         rows.append([declared[k].odds_of(one) for one in model.misfits(model.events[k], family)])
         best = float(np.sum(rows, axis=0).max())
-        is_low = (len(rows) == FIRST_EVENTS and best < FIRST_ODDS) or (len(rows) == len(may_gain) and best < SURE / 2)
+        is_low = (len(rows) == first and best < FIRST_ODDS) or (len(rows) == len(may_gain) and best < DOUBTFUL)
         if is_low and not whole:
             return none
     supports = (np.array(rows) > SUPPORTS).sum(axis=0)
@@ -475,7 +506,7 @@ def _refined(
 
 
 def _families(model: MountingModel, trace: MagnetTrace) -> Iterator[_Family]:
-    """Single causes: faults of one sensor, exchanged neighbours, other orders, other axes of all sensors, a turned bar."""
+    """Single causes: a sensor, exchanged neighbours, another order, other axes of all sensors, a turned bar."""
     bar = model.bar
     same = Mounting.declared(bar.sensor_count)
     for j in bar.array.tolist():
@@ -496,11 +527,8 @@ def _families(model: MountingModel, trace: MagnetTrace) -> Iterator[_Family]:
         yield _Family((_Hypothesis(fault, replace(same, channels=order)),), (a, b))
     for name, order in _orders(bar).items():
         fault = LikelyMistake("bar.sensors", name, "declare the sensors in the order of the file")
-        both = np.intersect1d(bar.array, order[bar.array])  # are array sensors in either order
-        compared = None if len(both) == len(bar.array) else both
-        moved = tuple(np.flatnonzero(order != same.channels).tolist()) if compared is None else ()
-        if len(both) >= MIN_SENSORS:
-            yield _Family((_Hypothesis(fault, replace(same, channels=order)),), moved, compared=compared)
+        moved = () if np.isin(order[bar.array], bar.array).all() else (*bar.references, *order[bar.references])
+        yield _Family((_Hypothesis(fault, replace(same, channels=order)),), references=tuple(int(k) for k in moved))
     for axis in range(3):
         signs_of_all = np.tile(np.where(np.arange(3) == axis, -1.0, 1.0), (bar.sensor_count, 1))
         fault = LikelyMistake("axes", _axes_text(signs_of_all[0]), "declare the axes as they are")
@@ -516,7 +544,7 @@ def _turned(angle_deg: float, bar: MagnetometerBar) -> _Hypothesis:
 
 
 def _at(sensor: int, bar: MagnetometerBar) -> Bools:
-    return np.arange(bar.sensor_count) == sensor
+    return np.asarray(np.arange(bar.sensor_count) == sensor)
 
 
 def _orders(bar: MagnetometerBar) -> dict[str, Indices]:
@@ -651,7 +679,7 @@ def _axes_text(signs: Floats) -> str:
 
 def _all_axes_text(signs: Floats, mirrored: bool) -> str:
     """What is wrong with all sensors."""
-    key = tuple(int(one) for one in signs)
+    key = (int(signs[0]), int(signs[1]), int(signs[2]))
     if mirrored:
         known = {
             (1, 1, 1): "left and right of the bar are exchanged", (-1, -1, 1): "the bar is mounted backwards",
