@@ -49,11 +49,11 @@ EVENTS_PER_SENSOR = 4
 """Strongest events of those that each sensor of the array sees best, and those that each reference sees best: what it
 sees of magnets shows that it is none."""
 QUIET_SHARE, QUIET_CHI2 = 0.2, 7.0
-"""Share of the road that shows the noise, and that quantile of chi-squared with 11 degrees of freedom: 14 means of 10 cm
-less a parabola."""
+"""Share of the road that shows the noise, and that quantile of chi-squared with 11 degrees of freedom: 14 means of
+10 cm less a parabola."""
 LOUD_SHARE, LOUD_CHI2, REFERENCE_NOISE = 0.75, 13.7, 1.5
-"""The same for reference sensors, and factor of their noise: that of a wheel, which is no dipole in the road, is louder at
-some parts of a turn than at others."""
+"""The same for reference sensors, and factor of their noise: that of a wheel, which is no dipole in the road, is louder
+at some parts of a turn than at others."""
 MIN_BINS = 9
 """Bins of an event, at least: those that METRO has at 50 m/s."""
 STARTS_M = (0.16, 0.35)
@@ -74,13 +74,14 @@ MAX_SHARE = 0.15
 """Largest share of an event's energy that a dipole leaves which explains it."""
 SURE, MIN_SUPPORT, SUPPORTS = 20.0, 3, 2.5
 """Log odds by which a fault must be likelier than the declared mounting, events that must support it, and log odds of
-an event that does. Source: `python -m benchmarks.magnets bars`: at most 8 on healthy bars."""
+an event that does. Source: `python -m benchmarks.magnets bars`: healthy bars reach 10 at most (a sensor beside a very
+noisy wheel), and those without such wheels 0."""
 DOUBTFUL = 12.0
 """Log odds of a fault of the whole bar from which on no magnets are reported."""
 DISTINCT = 8.0
 """Log odds by which a fault must be likelier than any other, to be corrected."""
 FIRST_EVENTS, FIRST_ODDS = 4, 2.0
-"""Strongest events that a fault is tried on first, and log odds with which it is tried on all. For speed."""
+"""Events that a fault is tried on first, and log odds with which it is tried on all. For speed."""
 SEEN_SHARE = 0.15
 """Share of an event's energy that a sensor must see for its faults to be tried."""
 
