@@ -54,6 +54,8 @@ QUIET_SHARE, QUIET_CHI2 = 0.2, 7.0
 LOUD_SHARE, LOUD_CHI2, REFERENCE_NOISE = 0.75, 13.7, 1.5
 """The same for reference sensors, and factor of their noise: that of a wheel, which is no dipole in the road, is louder
 at some parts of a turn than at others."""
+NOISE_BLOCKS = 300
+"""Stretches by which the noise is estimated, about. For speed."""
 MIN_BINS = 9
 """Bins of an event, at least: those that METRO has at 50 m/s."""
 STARTS_M = (0.16, 0.35)
@@ -76,7 +78,7 @@ SURE, MIN_SUPPORT, SUPPORTS = 20.0, 3, 2.5
 """Log odds by which a fault must be likelier than the declared mounting, events that must support it, and log odds of
 an event that does. Source: `python -m benchmarks.magnets bars`: healthy bars reach 10 at most (a sensor beside a very
 noisy wheel), and those without such wheels 0."""
-DOUBTFUL = 12.0
+UNREPORTED = 12.0
 """Log odds of a fault of the whole bar from which on no magnets are reported."""
 DISTINCT = 8.0
 """Log odds by which a fault must be likelier than any other, to be corrected."""
@@ -153,6 +155,7 @@ def _noise(mean: Floats, bar: MagnetometerBar) -> tuple[Floats, Floats]:
     """Noise of each channel (S, 3) as a sensor of the array and as a reference, of means (N, S, 3) of 10 cm."""
     size = round(HALF_WIDTH_M / BIN_M)
     blocks = mean[: len(mean) // size * size].reshape(-1, size, mean[0].size)
+    blocks = blocks[:: max(len(blocks) // NOISE_BLOCKS, 1)]
     blocks = blocks - blocks.mean(axis=1, keepdims=True)
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
     left = (blocks**2).sum(axis=1) - (np.einsum("kq,bkc->bqc", basis, blocks) ** 2).sum(axis=1)
@@ -422,7 +425,7 @@ def check_mounting(trace: MagnetTrace, bar: MagnetometerBar) -> MountingCheck:
     if sum(one.may_gain for one in model.declared()) < MIN_SUPPORT:
         return MountingCheck(declared)
     found = sorted(likely_faults(model, trace), key=lambda one: -one[0])
-    if not found or found[0][0] < (SURE if found[0][2].sensors else DOUBTFUL):
+    if not found or found[0][0] < (SURE if found[0][2].sensors else UNREPORTED):
         return MountingCheck(declared)
     # what was left off early may be as likely as what was found
     whole = [one for family in _families(model, trace) if not family.sensors for one in _judged(model, family, True)]
@@ -456,7 +459,7 @@ def _judged(model: MountingModel, family: _Family, whole: bool = False) -> Itera
     found = [(one, member, family) for one, member in zip(odds, family.members, strict=True) if one > 0]
     if found and family.members[0].mounting.yaw_rad:  # rotations that are near each other are no rivals
         best = max(found, key=lambda one: one[0])
-        yield best if best[0] < DOUBTFUL else _refined(model, *best)
+        yield best if best[0] < UNREPORTED else _refined(model, *best)
     else:
         yield from found
 
@@ -467,7 +470,7 @@ def _log_odds(model: MountingModel, family: _Family, whole: bool = False) -> lis
     declared = model.declared(family.references)
     turned = bool(family.members[0].mounting.yaw_rad)
     usable = [k for k, event in enumerate(model.events) if not turned or event.curvature < MAX_CURVATURE]
-    weights = {k: _seen_share(declared[k], family, model) for k in usable}
+    weights = _seen_shares(declared, family, model)
     may_gain = [k for k in usable if declared[k].may_gain and weights[k] > SEEN_SHARE]
     if len(may_gain) < MIN_SUPPORT:
         return none
@@ -478,19 +481,21 @@ def _log_odds(model: MountingModel, family: _Family, whole: bool = False) -> lis
     for k in (*may_gain, *others):
         rows.append([declared[k].odds_of(one) for one in model.misfits(model.events[k], family)])
         best = float(np.sum(rows, axis=0).max())
-        is_low = (len(rows) == first and best < FIRST_ODDS) or (len(rows) == len(may_gain) and best < DOUBTFUL)
+        is_low = (len(rows) == first and best < FIRST_ODDS) or (len(rows) == len(may_gain) and best < UNREPORTED)
         if is_low and not whole:
             return none
     supports = (np.array(rows) > SUPPORTS).sum(axis=0)
     return [float(odds) if n >= MIN_SUPPORT else 0.0 for odds, n in zip(np.sum(rows, axis=0), supports, strict=True)]
 
 
-def _seen_share(declared: _Misfit, family: _Family, model: MountingModel) -> float:
-    """Share of an event that the sensors of a fault and their neighbours see."""
+def _seen_shares(declared: Sequence[_Misfit], family: _Family, model: MountingModel) -> list[float]:
+    """Share of each event that the sensors of a fault and their neighbours see."""
     if not family.sensors:
-        return 1.0
-    near = np.unique([model.beside[j] for j in family.sensors])
-    return float(declared.by_sensor[np.isin(model.array, near)].sum())
+        return [1.0] * len(declared)
+    near = {int(k) for j in family.sensors for k in model.beside[j]}
+    of_array = np.array([float(j in near) for j in model.array.tolist()])
+    shares: list[float] = (np.stack([one.by_sensor for one in declared]) @ of_array).tolist()
+    return shares
 
 
 def _refined(
