@@ -140,7 +140,7 @@ def compile_traces() -> None:
 
     The drive is straight and even. `simulate_drive` would load 45 MB of scipy into an idle process.
     """
-    from app.decoders.magnet.decoder import decode_trace
+    from app.decoders.magnet.recording_check import decode_checked
     from app.simulation.magnetic.dipoles import dipole_field_ut
 
     tag = parse_tag("SNS_4_0.1_10-30")
@@ -156,7 +156,7 @@ def compile_traces() -> None:
         axis = (0.0, 0.0, 1.0) if magnet.orientation is Orientation.UP else (1.0, 0.0, 0.0)
         field_ut += dipole_field_ut(points_m, place_m, magnet.polarity.sign * MOMENT_AM2 * np.array(axis))
     trace = MagnetTrace(t_s, field_ut.reshape(t_s.size, -1, 3), t_s, np.full(t_s.size, _COMPILED_M_S))
-    decode_trace(trace, bar, candidates=TagCandidates(tags=[tag]))
+    decode_checked(trace, bar, candidates=TagCandidates(tags=[tag]))
 
 
 # === Samples.
