@@ -28,7 +28,7 @@ from app.decoders.cerpm.merge import (
 from app.decoders.cerpm.signal import SignalReport, SignalRules, profile_signals
 from app.decoders.cerpm.verify import FreshnessRules, SequenceSpan, Verification
 from app.decoders.magnet.identify import MAX_TAGS, ReadTrace, RegisteredTag, TagCandidates, TagFormat, match_tags
-from app.decoders.magnet.readings import Finding
+from app.decoders.magnet.readings import CheckedRecording, Finding
 from app.decoding.declarations import DeclaredPackets, DeclaredTrace
 from app.errors import UnreadableUpload, naming
 from app.formats.format import SpooledFile
@@ -117,7 +117,7 @@ def find_magnets(
     tags: tuple[str, ...],
     formats: tuple[TagFormat, ...],
     depth_m: float | None = -HALF_HEIGHT_M,
-) -> tuple[list[Finding], str]:
+) -> tuple[CheckedRecording, str]:
     """Findings in a recording, in the order of their completion, and the version of the decoder.
 
     Parameters
@@ -132,12 +132,13 @@ def find_magnets(
     if declared.method == "metro":
         from app.decoders.magnet import metro  # not loaded before: scipy.signal takes most of a second
 
-        return metro.decode_trace_metro(trace, declared.sensors), metro.VERSION
-    from app.decoders.magnet.decoder import VERSION, decode_trace
+        return CheckedRecording(metro.decode_trace_metro(trace, declared.sensors), (), trace), metro.VERSION
+    from app.decoders.magnet.decoder import VERSION
+    from app.decoders.magnet.recording_check import decode_checked
 
     known = [tag for text in tags if isinstance(tag := parse_tag(text), InformationTag)]
     candidates = TagCandidates(tags=known) if known else TagCandidates(formats=declared.tag_formats or formats)
-    return decode_trace(trace, bar_above(declared.sensors, depth_m), candidates=candidates), VERSION
+    return decode_checked(trace, bar_above(declared.sensors, depth_m), candidates=candidates), VERSION
 
 
 # === Files of a drive past CERPMs.

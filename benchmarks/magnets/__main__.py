@@ -1,7 +1,7 @@
 """``python -m benchmarks.magnets [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: recall, lateral, tags, ratio, wheel, lines, false, speed, drawn, physics, all. The decoder does not know the
-clearance.
+Items: recall, lateral, tags, ratio, wheel, lines, false, speed, drawn, physics, bars, all. The decoder does not know
+the clearance.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ from app.markers.magnet import Orientation
 from app.sensors.magnetometer_bar import MagnetTrace
 from app.simulation.magnetic.drive import Course, SimulatedDrive, Vehicle
 from benchmarks.magnets import drawn_scenes, scenes
+from benchmarks.magnets.bars import run_bars
 from benchmarks.magnets.physics import run_physics
 from benchmarks.magnets.score import TagTally, Tally, score_magnets, score_tags
 
-ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "lines", "false", "speed", "drawn", "physics")
+ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "lines", "false", "speed", "drawn", "physics", "bars")
 REFERENCE = Path(__file__).parents[1] / "reference"
 BAR = Vehicle.compact().bar
 LOW_BAR_M = 0.30
@@ -392,6 +393,7 @@ def _drawn_row(name: str, shares: Sequence[float], goal: float, total: Tally) ->
 RUNS: dict[str, Callable[[int, bool], Result]] = {
     "recall": run_recall, "lateral": run_lateral, "tags": run_tags, "ratio": run_ratio, "wheel": run_wheel,
     "lines": run_lines, "false": run_false, "speed": run_speed, "drawn": run_drawn, "physics": run_physics,
+    "bars": run_bars,
 }  # fmt: skip
 
 if __name__ == "__main__":

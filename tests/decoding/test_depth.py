@@ -57,8 +57,9 @@ def test_buried_magnets_are_read_with_the_clearance_of_the_vehicle() -> None:
     scene = Scene(Road(60.0), Vehicle.compact(clearance_m=0.16, wheel_moment_am2=0.0), Course(10.0), tags=tags)
     trace = simulate_drive(scene, np.random.default_rng(8)).trace
     declared = DeclaredTrace(unit="uT", axes="ISO8855", bar=BarDeclaration(forward_m=3.2, clearance_m=0.16))
-    found, _version = find_magnets(trace, declared, (tags[0].tag.text,), (), depth_m)
-    magnets = [one for one in found if isinstance(one, MagnetReading)]
+    checked, _version = find_magnets(trace, declared, (tags[0].tag.text,), (), depth_m)
+    findings = checked.findings
+    magnets = [one for one in findings if isinstance(one, MagnetReading)]
     assert [one.polarity.value for one in magnets] == ["N", "S", "N"]
     assert np.median([one.clearance_cm for one in magnets]) == pytest.approx(31.0, abs=3.0)
-    assert not find_mistakes(trace, bar_above(declared.sensors, depth_m), found, depth_m=depth_m)
+    assert not find_mistakes(trace, bar_above(declared.sensors, depth_m), findings, depth_m=depth_m)

@@ -10,19 +10,20 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.markers.magnet import MOMENT_AM2, Orientation, Polarity
-from app.simulation.magnetic.clutter import KINDS, Clutter
-from app.simulation.magnetic.dipoles import METRO_CYLINDER, Cylinder, cylinder_dipoles, dipole_field_ut
-from app.simulation.magnetic.drive import EARTH_UT, Scene, Vehicle, simulate_drive
-from app.simulation.magnetic.recorder import Chip
-from app.simulation.magnetic.road import Road, RoadMagnet
-from app.simulation.magnetic.spheroids import (
+from app.simulation.magnetic.clutter import (
+    KINDS,
     SHAPES,
+    Clutter,
     Spheroid,
     demagnetising_factors,
     spheroid_clutter,
     spheroid_dipoles,
     spheroid_moment_am2,
 )
+from app.simulation.magnetic.dipoles import METRO_CYLINDER, Cylinder, cylinder_dipoles, dipole_field_ut
+from app.simulation.magnetic.drive import EARTH_UT, Scene, Vehicle, simulate_drive
+from app.simulation.magnetic.recorder import Chip
+from app.simulation.magnetic.road import Road, RoadMagnet
 from app.values import Floats
 
 MU0_UT = 0.4 * math.pi  # [uT / (A/m)]

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
+from app.sensors.magnetometer_bar import MagnetTrace
 from app.values import Floats
 
 
@@ -109,6 +110,30 @@ class NoiseFinding:
 
 
 Finding = MagnetReading | LineCrossing | TagReading | NoiseFinding
+
+
+@dataclass(frozen=True, slots=True)
+class LikelyMistake:
+    """A declaration that the recording contradicts."""
+
+    field: str  # of the declaration
+    reason: str  # what does not fit, with figures
+    cure: str  # what to declare
+
+    @property
+    def text(self) -> str:
+        """Reason and cure in one sentence."""
+        return f"{self.reason}: {self.cure}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedRecording:
+    """A recording that was decoded as its bar is mounted."""
+
+    findings: list[Finding]
+    faults: tuple[LikelyMistake, ...]  # of the bar: none where it is as declared
+    trace: MagnetTrace  # as the declared bar would have recorded it
+    is_refused: bool = False  # the bar is not as declared, and how it is cannot be decided
 
 
 # === Where magnets lie on the plane: speed integrated along the heading, and the place on the bar (equation 1).

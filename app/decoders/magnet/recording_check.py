@@ -1,6 +1,7 @@
-"""Whether units and axes of a recording can be what was declared, and the mistake that is likely if not.
+"""Whether bar and units of a recording can be what was declared, and the mistake that is likely if not.
 
-Two invariants are used. The horizontal field of the earth turns with the heading of the vehicle, whatever offsets the
+The mounting of the bar is compared first (`mounting`), and corrected where the recording decides it. Two invariants
+are used for the rest. The horizontal field of the earth turns with the heading of the vehicle, whatever offsets the
 sensors have: its size shows the unit, its sense and its phase the axes. And magnets are dipoles: a speed or a field
 in a wrong unit distorts them, so that none is read, or all of them look much too weak or too strong at a wrong
 clearance; in the right unit they are read, and look like the magnets that are sold.
@@ -10,16 +11,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from app.decoders.magnet.decoder import decode_trace
 from app.decoders.magnet.identify import TagCandidates
-from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding, NoiseKind
+from app.decoders.magnet.mounting import MAX_PHASE_DEG, MIRRORED, as_declared, check_mounting, turning_field
+from app.decoders.magnet.readings import (
+    CheckedRecording,
+    Finding,
+    LikelyMistake,
+    MagnetReading,
+    NoiseFinding,
+    NoiseKind,
+)
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
-from app.values import Floats
 
 SURE_CONFIDENCE = 0.99
 """[probability] of a magnet that counts."""
@@ -57,33 +65,39 @@ AXES = {
 EARTH_HORIZONTAL_UT = (8.0, 60.0)
 """[uT] amplitude with which the earth's horizontal field turns. Source: it is 10 to 42 uT below 65 degrees of latitude
 (World Magnetic Model); a third of margin for the iron of a vehicle."""
-MIN_TURN_DEG, RATE_HZ = 60.0, 5.0
-"""[deg, Hz] change of heading from which on the earth's field is compared, and rate at which."""
-MAX_RESIDUAL = 0.5
-"""[amplitude] root mean square of what the turning field leaves, above which nothing is concluded."""
-MAX_PHASE_DEG = 60.0
-"""[deg] between the heading and the field's direction. Source: magnetic declination is below 30 degrees in inhabited
-regions (World Magnetic Model), and iron adds some."""
-MIRRORED = 2.0
-"""[1] amplitude of the field that turns the other way over that of the one that turns as it must."""
-
-
 CONTRADICTED_M = 0.06
 """[m] between the declared clearance and that of the magnets. Source: a load lowers a car by up to 5 cm."""
 
 
-@dataclass(frozen=True, slots=True)
-class LikelyMistake:
-    """A declaration that the recording contradicts."""
+def decode_checked(
+    trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCandidates | None = None
+) -> CheckedRecording:
+    """Findings of a whole trace, decoded as its bar is mounted.
 
-    field: str  # of the declaration
-    reason: str  # what does not fit, with figures
-    cure: str  # what to declare
+    Where the recording shows that the bar is not as declared, but not how it is, no magnet is reported.
+    """
+    check = check_mounting(trace, bar)
+    if check.mounting is None:
+        findings = decode_trace(trace, bar, candidates=candidates)
+        refused = [_refused(one, check.faults[0]) for one in findings if isinstance(one, MagnetReading | NoiseFinding)]
+        return CheckedRecording([*_notes(check.faults, trace), *refused], check.faults, trace, True)
+    mounted = as_declared(check.mounting, trace, bar) if check.faults else trace
+    findings = decode_trace(mounted, bar, candidates=candidates)
+    return CheckedRecording([*_notes(check.faults, trace, "; corrected"), *findings], check.faults, mounted)
 
-    @property
-    def text(self) -> str:
-        """Reason and cure in one sentence."""
-        return f"{self.reason}: {self.cure}"
+
+def _notes(faults: Sequence[LikelyMistake], trace: MagnetTrace, suffix: str = "") -> list[NoiseFinding]:
+    """Faults of the bar as findings, at the beginning of the recording."""
+    start_s = float(trace.t_s[0]) if len(trace.t_s) else 0.0
+    return [NoiseFinding(start_s, 0.0, 0.0, NoiseKind.SENSOR, fault.reason + suffix) for fault in faults]
+
+
+def _refused(one: MagnetReading | NoiseFinding, fault: LikelyMistake) -> NoiseFinding:
+    """A magnet as the finding that its bar is not as declared."""
+    if isinstance(one, NoiseFinding):
+        return one
+    reason = f"not reported, as the bar is not as declared: {fault.reason}"
+    return NoiseFinding(one.t_s, one.odometer_m, one.lateral_cm, NoiseKind.SENSOR, reason)
 
 
 def find_mistakes(
@@ -138,26 +152,12 @@ def compare_with_clearance(
 
 
 def compare_with_earth(trace: MagnetTrace, bar: MagnetometerBar) -> LikelyMistake | None:
-    """The mistake that the earth's horizontal field shows while the vehicle turns, if there is one.
-
-    With x forward, y left and the heading h clockwise from north, x + iy of the earth's field is H exp(i (h - D)) and
-    constant offsets, where D is the declination. One more term, in exp(-ih), is left where an axis is mirrored.
-    """
-    if trace.heading_t_s is None or trace.heading_deg is None or not len(trace.heading_t_s):
+    """The mistake that the earth's horizontal field shows while the vehicle turns, if there is one."""
+    turning = turning_field(trace, bar)
+    if turning is None:
         return None
-    step = max(round(trace.rate_hz / RATE_HZ), 1)
-    field: Floats = np.nanmedian(trace.field_ut[::step][:, bar.array], axis=1).astype(float)
-    heading = np.interp(trace.t_s[::step], trace.heading_t_s, np.unwrap(np.radians(trace.heading_deg)))
-    known = np.isfinite(field).all(axis=1)
-    if known.sum() < 20 or np.ptp(heading[known]) < np.radians(MIN_TURN_DEG):
-        return None
-    turning, seen = np.exp(1j * heading[known]), field[known, 0] + 1j * field[known, 1]
-    shape = np.stack([turning, turning.conj(), np.ones_like(turning)], axis=1)
-    fitted = np.linalg.lstsq(shape, seen, rcond=None)[0]
-    along, against, _offset = fitted
+    along, against = turning
     amplitude = max(abs(along), abs(against))
-    if float(np.sqrt(np.mean(np.abs(seen - shape @ fitted) ** 2))) > MAX_RESIDUAL * amplitude:
-        return None
     if abs(against) > MIRRORED * abs(along):
         return LikelyMistake(
             "axes",

@@ -383,10 +383,8 @@ def decode_upload(one: MagnetPass, simulated: SimulatedDrive) -> ReadTrace:
     with pack(write_tables(simulated.trace)).open() as stream:
         trace = read_trace({"drive.zip": stream}, declared).trace
     nearby = NearbyTags.of(one.rows, EPOCH)
-    findings, _version = find_magnets(
-        trace, declared, nearby.texts, () if nearby.texts else one.formats, nearby.depth_m
-    )
-    return nearby.match(findings, declared.sensors)
+    checked, _version = find_magnets(trace, declared, nearby.texts, () if nearby.texts else one.formats, nearby.depth_m)
+    return nearby.match(checked.findings, declared.sensors)
 
 
 def read_tag(one: MagnetPass) -> tuple[bool, list[float] | None, list[str]]:

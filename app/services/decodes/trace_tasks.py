@@ -90,10 +90,13 @@ def decode_recording(
         content = read_trace({name: stream}, declared, limits)
     loaded = time.perf_counter()
     trace, report = content.trace, content.report
-    findings, version = find_magnets(trace, declared, tags, formats, depth_m)
-    if declared.method == "matched":
+    checked, version = find_magnets(trace, declared, tags, formats, depth_m)
+    findings = checked.findings
+    for mistake in checked.faults:
+        report.warn(mistake.text)
+    if declared.method == "matched" and not checked.is_refused:
         bar = bar_above(declared.sensors, depth_m)
-        for mistake in find_mistakes(trace, bar, findings, depth_m=depth_m or 0.0):
+        for mistake in find_mistakes(checked.trace, bar, findings, depth_m=depth_m or 0.0):
             report.warn(mistake.text)
     report.load_ms, report.decode_ms = 1e3 * (loaded - began), 1e3 * (time.perf_counter() - loaded)
     speed = np.interp(trace.t_s, trace.speed_t_s, trace.speed_m_s)
@@ -137,7 +140,7 @@ def compile_traces() -> None:
 
     The drive is straight and even. `simulate_drive` would load 45 MB of scipy into an idle process.
     """
-    from app.decoders.magnet.decoder import decode_trace
+    from app.decoders.magnet.recording_check import decode_checked
     from app.simulation.magnetic.dipoles import dipole_field_ut
 
     tag = parse_tag("SNS_4_0.1_10-30")
@@ -153,7 +156,7 @@ def compile_traces() -> None:
         axis = (0.0, 0.0, 1.0) if magnet.orientation is Orientation.UP else (1.0, 0.0, 0.0)
         field_ut += dipole_field_ut(points_m, place_m, magnet.polarity.sign * MOMENT_AM2 * np.array(axis))
     trace = MagnetTrace(t_s, field_ut.reshape(t_s.size, -1, 3), t_s, np.full(t_s.size, _COMPILED_M_S))
-    decode_trace(trace, bar, candidates=TagCandidates(tags=[tag]))
+    decode_checked(trace, bar, candidates=TagCandidates(tags=[tag]))
 
 
 # === Samples.

@@ -12,11 +12,10 @@ import scipy
 
 from app.markers.magnet import MOMENT_AM2, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
-from app.simulation.magnetic.clutter import Clutter, dipole_clutter, place_clutter
+from app.simulation.magnetic.clutter import Clutter, dipole_clutter, place_clutter, spheroid_clutter
 from app.simulation.magnetic.dipoles import Cylinder, add_static_field, cylinder_dipoles, dipole_field_ut
 from app.simulation.magnetic.recorder import CanBus, Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, Spread, place_magnets, tag_magnets
-from app.simulation.magnetic.spheroids import spheroid_clutter
 from app.values import Floats
 
 # === How a vehicle moves over the road: speed, path, springs, and its magnetised wheels.
@@ -206,7 +205,7 @@ class Scene:
     earth_ut: tuple[float, float, float] = EARTH_UT
     moment_am2: float = MOMENT_AM2
     magnet_shape: Cylinder | None = None  # size of the magnets; None for point dipoles
-    # clutter of spheroids that the earth's field magnetises (`spheroids`) in place of dipoles
+    # clutter of spheroids that the earth's field magnetises in place of dipoles
     spheroid_iron: bool = False
 
 
