@@ -86,10 +86,10 @@ PIECE_M, AROUND_M = 240.0, 60.0
 """Pieces of the road for which explanations of the wheels' noise are compared, and the road before and after that is
 decoded with one. [m] Source: a hundred turns, and `BEGINNING_M`."""
 ROAD_STEP = 25  # [blocks] of which one odometer is kept: half a metre
-MIN_ROW, TURN_ERROR, ROW_WIDTH_M, MAX_ROW_STEP_M = 4, 0.03, 0.2, 5.0
+MIN_ROW, TURN_ERROR, ROW_WIDTH_M, MAX_ROW_STEP_M = 4, 0.02, 0.2, 5.0
 """Dipoles in a row at one or two turns of a wheel, from which on they may be a line that was learnt, or a wheel; share
-of a turn by which they may be off, distance across, and longest step. [1, 1, m, m] Source: beside lines of 0.98 to 1.02
-turns magnets are lost at 33 cm (decision 0014)."""
+of a turn by which they may be off, distance across, and longest step. [1, 1, m, m] Source: of lines that are 2 % off,
+magnets were lost at 33 cm, of those 2.5 % off few (decision 0014)."""
 
 
 class Seen(NamedTuple):
@@ -354,9 +354,10 @@ class _WholeDecoder(MagnetDecoder):
         road = np.concatenate(self._road)
         return float(np.interp(odometer_m, road[:, 0], road[:, 1], -math.inf, math.inf))
 
-    def explained(self, start_m: float, stop_m: float) -> float:
-        """Energy that the magnets of a piece of the road explain, less that of what is no magnet under the bar."""
-        return sum(one.explained for one in self._seen if start_m <= one.odometer_m < stop_m)
+    def explained(self, start_m: float, stop_m: float) -> tuple[float, float]:
+        """Energy that the magnets of a piece of the road explain less that of what is no magnet, and their share."""
+        here = np.array([one.explained for one in self._seen if start_m <= one.odometer_m < stop_m])
+        return float(here.sum()), float(here[here > 0].sum() / max(float(abs(here).sum()), POLE_ENERGY))
 
     def is_doubtful(self, start_m: float, stop_m: float) -> bool:
         """Whether a line may have been taken for a wheel in a piece of the road, or a wheel for a line.
@@ -394,16 +395,16 @@ def decode_trace(trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCan
     """
     wheels = learn_wheels(trace, bar)
     found, decoder = _decode(trace, bar, wheels, candidates)
-    pieces = [
-        better
+    others = [
+        other
         for start_m, stop_m in _doubtful_pieces(decoder)
-        if (better := _likeliest(trace, bar, decoder, start_m, stop_m)) is not None
+        if (other := _likeliest(trace, bar, candidates, decoder, start_m, stop_m)) is not None
     ]
-    if pieces:
-        found, decoder = _decode(trace, bar, wheels.with_pieces(pieces), candidates)
-    if decoder.state.is_known:
-        return found
-    return [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, OF_MAGNETS)]
+    if others and others[0].piece.start_m == -math.inf and others[0].piece.stop_m == math.inf:
+        found, decoder = others[0].found, others[0].decoder
+    elif others:
+        found, decoder = _decode(trace, bar, wheels.with_pieces([other.piece for other in others]), candidates)
+    return found
 
 
 def _decode(
@@ -412,6 +413,7 @@ def _decode(
     """Findings of a trace with the clearance that it shows, and the decoder that found them."""
     decoder, found = _estimate(trace, bar, wheels, candidates)
     if not decoder.state.is_known:
+        found = [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, OF_MAGNETS)]
         return found, decoder
     decoder = _WholeDecoder(bar, wheels, candidates, decoder.state)
     found = [finding for chunk in _chunks(trace) for finding in decoder.feed(chunk)]
@@ -425,13 +427,27 @@ def _doubtful_pieces(decoder: _WholeDecoder) -> list[tuple[float, float]]:
     return [piece for piece in pairwise(edges) if decoder.is_doubtful(*piece)]
 
 
+class _Explanation(NamedTuple):
+    """Noise of the wheels over a piece of the road, and what was found with it."""
+
+    piece: Piece
+    found: list[Finding]
+    decoder: _WholeDecoder
+
+
 def _likeliest(
-    trace: MagnetTrace, bar: MagnetometerBar, decoder: _WholeDecoder, start_m: float, stop_m: float
-) -> Piece | None:
+    trace: MagnetTrace,
+    bar: MagnetometerBar,
+    candidates: TagCandidates | None,
+    decoder: _WholeDecoder,
+    start_m: float,
+    stop_m: float,
+) -> _Explanation | None:
     """What explains a piece of the road better than the noise that was learnt on the way; None if nothing does.
 
     Compared are noise that is the same in every turn, as some turns show it, and no noise at all: by the energy that
-    magnets explain, less that which none explains.
+    magnets explain, less that which none explains. The share of magnets must not fall: over iron alone, all energies
+    fall where noise is left in.
     """
     part = trace.between(decoder.time_s(start_m - AROUND_M), decoder.time_s(stop_m + AROUND_M))
     reach_m = decoder.odometer_m(float(part.t_s[0])) if start_m > -math.inf else 0.0
@@ -441,10 +457,11 @@ def _likeliest(
     front.take(blocks, final=True)
     best, most = None, decoder.explained(start_m, stop_m)
     for turns in (*wheels.constant_turns(blocks.s, blocks.yaw, blocks.x), None):
-        _, other = _decode(part, bar, wheels.with_pieces([Piece(-math.inf, math.inf, turns)]))
+        found, other = _decode(part, bar, wheels.with_pieces([Piece(-math.inf, math.inf, turns)]), candidates)
         explained = other.explained(start_m - reach_m, stop_m - reach_m)
-        if explained > most:
-            best, most = Piece(start_m, stop_m, turns.moved(reach_m) if turns else None), explained
+        if explained[0] > most[0] and explained[1] >= most[1]:
+            piece = Piece(start_m, stop_m, turns.moved(reach_m) if turns else None)
+            best, most = _Explanation(piece, found, other), explained
     return best
 
 

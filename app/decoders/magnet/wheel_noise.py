@@ -174,7 +174,7 @@ class ConstantTurns:
     def noise_ut(self, s: Floats) -> Floats:
         """The noise of each sensor at odometers s (N,), shape (N, S, 3). [uT]"""
         phases = np.array([np.interp(s, self._s, of_wheel) for of_wheel in self._phases.T]).T
-        return np.einsum("nk,sak->nsa", _regressors(phases), self._weights)
+        return np.asarray(np.einsum("nk,sak->nsa", _regressors(phases), self._weights))
 
     def moved(self, by_m: float) -> ConstantTurns:
         """The same where odometers are larger. [m]"""
