@@ -447,7 +447,7 @@ def _likeliest(
 
     Compared are noise that is the same in every turn, as some turns show it, and no noise at all: by the energy that
     magnets explain, less that which none explains. The share of magnets must not fall: over iron alone, all energies
-    fall where noise is left in.
+    fall where noise is left in. Where magnets explain all, nothing further is tried.
     """
     part = trace.between(decoder.time_s(start_m - AROUND_M), decoder.time_s(stop_m + AROUND_M))
     reach_m = decoder.odometer_m(float(part.t_s[0])) if start_m > -math.inf else 0.0
@@ -462,6 +462,8 @@ def _likeliest(
         if explained[0] > most[0] and explained[1] >= most[1]:
             piece = Piece(start_m, stop_m, turns.moved(reach_m) if turns else None)
             best, most = _Explanation(piece, found, other), explained
+            if most[1] == 1:
+                break
     return best
 
 

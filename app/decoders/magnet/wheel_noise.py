@@ -300,7 +300,7 @@ class WheelNoiseCanceller:
         self._progress["yaw_rad"] *= -1.0
 
     def constant_turns(self, s: Floats, yaw: Floats, x: Floats) -> list[ConstantTurns]:
-        """Noise that a stretch of road can have in every turn: at most one for each of `_first_turns`.
+        """Noise that a stretch of road can have in every turn, that of which most turns are alike first.
 
         A wheel's noise is the same in all turns, those before a line and after it included; a line begins and ends. So
         the turns that are alike but for the chips' noise are searched, from a few of them on, and the harmonics are
@@ -318,16 +318,17 @@ class WheelNoiseCanceller:
         variance = np.median(abs(np.diff(field, axis=0)), axis=0) ** 2 * (MEDIAN_DEVIATION**2 / 2)
         near, references = self._channels.near, self._turns.references
         turn = np.maximum.accumulate(((phases[:, 0] - phases[0, 0]) / (2 * math.pi)).astype(np.int64))
+        turn = np.unique(turn, return_inverse=True)[1]
         turns = _fourier_turns(phases, field / np.sqrt(np.maximum(variance, MIN_VARIANCE_UT2)), near, turn)
         turns[:, references] = 0.0
-        found: list[ConstantTurns] = []
         alike: list[Bools] = []
         for first in _first_turns(turns):
             same = _alike(turns, first, 3 * (len(near) - references.size))
-            if any((same & other).sum() > SAME_SHARE * (same | other).sum() for other in alike):
-                continue
-            alike.append(same)
-            here = np.append(same, [False] * (int(turn[-1]) + 1 - same.size))[turn]
+            if not any((same & other).sum() > SAME_SHARE * (same | other).sum() for other in alike):
+                alike.append(same)
+        found = []
+        for same in sorted(alike, key=lambda one: -int(one.sum())):
+            here = np.append(same, False)[turn]
             weights = _fit_turns(phases[here], field[here], variance, near, references)
             found.append(ConstantTurns(s, phases, weights))
         return found
@@ -344,7 +345,7 @@ def _without_offset(s: Floats, x: Floats) -> Floats:
 def _regressors(phases: Floats) -> Floats:
     """Cosine and sine of each harmonic, wheel by wheel, at phases (N, W): shape (N, 2 W HARMONICS)."""
     angles = phases[:, :, None] * np.arange(1, HARMONICS + 1)
-    return np.stack([np.cos(angles), np.sin(angles)], axis=3).reshape(len(phases), -1)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=3).reshape(len(phases), 2 * HARMONICS * phases.shape[1])
 
 
 def _fourier_turns(phases: Floats, x: Floats, near: Floats, turn: Ints) -> Floats:
