@@ -365,7 +365,7 @@ class _WholeDecoder(MagnetDecoder):
         magnets, others = float(here[here > 0].sum()), float(-here[here < 0].sum())
         return magnets - OTHER_WEIGHT * others, magnets / max(magnets + others, POLE_ENERGY)
 
-    def is_doubtful(self, start_m: float, stop_m: float) -> bool:
+    def is_ambiguous(self, start_m: float, stop_m: float) -> bool:
         """Whether a line may have been taken for a wheel in a piece of the road, or a wheel for a line.
 
         So it is where noise was held back, or dipoles follow each other at one or two turns of a noisy wheel.
@@ -405,7 +405,7 @@ def decode_trace(
     found, decoder = _decode(trace, bar, wheels, candidates)
     others = [
         other
-        for start_m, stop_m in (_doubtful_pieces(decoder) if compare else [])
+        for start_m, stop_m in (_ambiguous_pieces(decoder) if compare else [])
         if (other := _likeliest(trace, bar, candidates, decoder, start_m, stop_m)) is not None
     ]
     if others and others[0].piece.start_m == -math.inf and others[0].piece.stop_m == math.inf:
@@ -428,11 +428,11 @@ def _decode(
     return found + decoder.finish(), decoder
 
 
-def _doubtful_pieces(decoder: _WholeDecoder) -> list[tuple[float, float]]:
+def _ambiguous_pieces(decoder: _WholeDecoder) -> list[tuple[float, float]]:
     """Pieces of the road where a line may have been taken for a wheel's noise, or the reverse. [m]"""
     count = max(round(decoder.driven_m / PIECE_M), 1)
     edges = [-math.inf, *(decoder.driven_m * k / count for k in range(1, count)), math.inf]
-    return [piece for piece in pairwise(edges) if decoder.is_doubtful(*piece)]
+    return [piece for piece in pairwise(edges) if decoder.is_ambiguous(*piece)]
 
 
 class _Explanation(NamedTuple):
