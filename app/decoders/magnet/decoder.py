@@ -454,8 +454,9 @@ def _likeliest(
     """What explains a piece of the road better than the noise that was learnt on the way; None if nothing does.
 
     Compared are noise that is the same in every turn, as some turns show it, and no noise at all: by the energy that
-    magnets explain, less that which none explains. The share of magnets must not fall: over iron alone, all energies
-    fall where noise is left in. Where magnets explain all, nothing further is tried.
+    magnets explain, less that which none explains, which must be positive: what leaves that much is no explanation. The
+    share of magnets must not fall: over iron alone, all energies fall where noise is left in. Where magnets explain
+    all, nothing further is tried.
     """
     part = trace.between(decoder.time_s(start_m - AROUND_M), decoder.time_s(stop_m + AROUND_M))
     reach_m = decoder.odometer_m(float(part.t_s[0])) if start_m > -math.inf else 0.0
@@ -467,7 +468,7 @@ def _likeliest(
     for turns in (*wheels.constant_turns(blocks.s, blocks.yaw, blocks.x), None):
         found, other = _decode(part, bar, wheels.with_pieces([Piece(-math.inf, math.inf, turns)]), candidates)
         explained = other.explained(start_m - reach_m, stop_m - reach_m)
-        if explained[0] > most[0] and explained[1] >= most[1]:
+        if explained[0] > max(most[0], 0.0) and explained[1] >= most[1]:
             piece = Piece(start_m, stop_m, turns.moved(reach_m) if turns else None)
             best, most = _Explanation(piece, found, other), explained
             if most[1] == 1:
