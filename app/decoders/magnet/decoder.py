@@ -9,11 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from copy import deepcopy
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from app.decoders.magnet.classify import (
     FORGET_M,
+    POLE_ENERGY,
     Accepted,
     Classification,
     MagnetState,
@@ -50,11 +53,12 @@ from app.decoders.magnet.readings import (
     TagReading,
     VehiclePath,
 )
-from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
+from app.decoders.magnet.wheel_noise import Piece, WheelNoiseCanceller
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+from app.values import Floats
 
-VERSION = "matched-8"
+VERSION = "matched-9"
 """Kept with every decode; to be raised when findings change."""
 FIRST_VARIANCE = 2.0
 """Variance of the matched filters' noise that is assumed at first. [uT2] Source: a chip's noise of 1.5 uT."""
@@ -76,6 +80,35 @@ CHUNK_SAMPLES = 4096
 BEGINNING_M = 60.0
 """Distance of a whole trace from which the noise of the wheels is learnt first. [m] Source: that over which it is
 learnt (`app.decoders.magnet.wheel_noise.LEARN_M`)."""
+
+
+PIECE_M, AROUND_M = 240.0, 60.0
+"""Pieces of the road for which explanations of the wheels' noise are compared, and the road before and after that is
+decoded with one. [m] Source: a hundred turns, and `BEGINNING_M`."""
+ROAD_STEP = 25  # [blocks] of which one odometer is kept: half a metre
+MIN_ROW, TURN_ERROR, ROW_WIDTH_M, MAX_ROW_STEP_M = 4, 0.02, 0.2, 5.0
+"""Dipoles in a row at one or two turns of a wheel, from which on they may be a line that was learnt, or a wheel; share
+of a turn by which they may be off, distance across, and longest step. [1, 1, m, m] Source: of lines that are 2 % off,
+magnets were lost at 33 cm, of those 2.5 % off few (decision 0014)."""
+
+
+OTHER_WEIGHT = 5.0
+"""[1] of energy that no magnet explains, against that of magnets. Source: where a line covers a whole recording, what
+is left of magnets that were taken out is often another magnet (seeds 7701 and 9301 of lines of one turn at 33 cm)."""
+
+
+MIN_GAIN = 1.2
+"""[1] energy that another explanation must have over that of the learnt noise. Source: energies are in units of
+each explanation's own noise, which differs by a seventh where they explain the same (a recording of the corpus); of
+lines that were taken for wheels, the gain is two and more."""
+
+
+class Seen(NamedTuple):
+    """Where a strong dipole lies, and the energy it explains: negative under the bar if it is no magnet, 0 beside."""
+
+    odometer_m: float
+    lateral_m: float
+    explained: float
 
 
 class MagnetDecoder:
@@ -148,7 +181,7 @@ class MagnetDecoder:
         count = self._blocks.s.size
         self._preprocessor.take(self._blocks, final=final)
         s, yaw, x = self._blocks.s[count:], self._blocks.yaw[count:], self._blocks.x[count:]
-        self._wheels.cancel(s, yaw, x)
+        self._take_out(s, self._blocks.t[count:], yaw, x)
         self._bins.append(s, np.ascontiguousarray(x[:, self.bar.array]))
         self._path.append(s, yaw)
         self._search(final)
@@ -161,6 +194,10 @@ class MagnetDecoder:
     def _region_bins(self) -> int:
         """Bins of the open region, 0 without one."""
         return int(self._state[REGION_BINS])
+
+    def _take_out(self, s: Floats, t_s: Floats, yaw: Floats, x: Floats) -> None:
+        """Take the wheels' noise out of new blocks, in place."""
+        self._wheels.cancel(s, yaw, x)
 
     def _search(self, final: bool) -> None:
         """Score the bins that are complete, and detect the dipoles of each region that ends."""
@@ -281,19 +318,168 @@ def _is_iron(classification: Classification) -> bool:
     return isinstance(classification, Rejected) and classification.kind is NoiseKind.FERROUS
 
 
-def decode_trace(trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCandidates | None = None) -> list[Finding]:
+class _WholeDecoder(MagnetDecoder):
+    """Decodes a whole trace, and keeps what shows how well its noise of the wheels was known."""
+
+    def __init__(
+        self,
+        bar: MagnetometerBar,
+        wheels: WheelNoiseCanceller,
+        candidates: TagCandidates | None,
+        state: MagnetState | None = None,
+    ) -> None:
+        super().__init__(bar, candidates=candidates, state=state, wheels=wheels)
+        self._seen: list[Seen] = []
+        self._road: list[Floats] = []  # odometer and time (N, 2), about every half metre
+        self._held_back: list[tuple[float, float]] = []  # stretches where the wheels' noise was not taken out
+        self._turns: list[tuple[float, Floats]] = []  # odometer and the lengths of a turn of the noisy wheels
+
+    def _take_out(self, s: Floats, t_s: Floats, yaw: Floats, x: Floats) -> None:
+        held_back_m = self._wheels.held_back_m
+        super()._take_out(s, t_s, yaw, x)
+        if s.size:
+            self._road.append(np.stack([s, t_s], 1)[::ROAD_STEP])
+            self._turns.append((float(s[-1]), self._wheels.lengths_m))
+            if self._wheels.held_back_m > held_back_m:
+                self._held_back.append((float(s[0]), float(s[-1])))
+
+    def _reading(self, dipole: Dipole, classification: Classification) -> MagnetReading | NoiseFinding:
+        reading = super()._reading(dipole, classification)
+        if dipole.explained >= POLE_ENERGY:
+            sign = 1 if isinstance(reading, MagnetReading) else -int(is_strong(dipole, self._array.half_width_m))
+            self._seen.append(Seen(reading.odometer_m, reading.lateral_cm / 100, sign * dipole.explained))
+        return reading
+
+    @property
+    def driven_m(self) -> float:
+        """Distance so far. [m]"""
+        return float(self._road[-1][-1, 0]) if self._road else 0.0
+
+    def odometer_m(self, t_s: float) -> float:
+        """Odometer at a time. [m]"""
+        road = np.concatenate(self._road)
+        return float(np.interp(t_s, road[:, 1], road[:, 0]))
+
+    def time_s(self, odometer_m: float) -> float:
+        """Time at an odometer; infinite beyond the road. [s]"""
+        road = np.concatenate(self._road)
+        return float(np.interp(odometer_m, road[:, 0], road[:, 1], -math.inf, math.inf))
+
+    def explained(self, start_m: float, stop_m: float) -> tuple[float, float]:
+        """Energy of the magnets in a piece of the road less that of what is none by its weight, and their share."""
+        here = np.array([one.explained for one in self._seen if start_m <= one.odometer_m < stop_m])
+        magnets, others = float(here[here > 0].sum()), float(-here[here < 0].sum())
+        return magnets - OTHER_WEIGHT * others, magnets / max(magnets + others, POLE_ENERGY)
+
+    def is_ambiguous(self, start_m: float, stop_m: float) -> bool:
+        """Whether a line may have been taken for a wheel in a piece of the road, or a wheel for a line.
+
+        So it is where noise was held back, or dipoles follow each other at one or two turns of a noisy wheel.
+        """
+        if any(first < stop_m and last >= start_m for first, last in self._held_back):
+            return True
+        row: list[tuple[Seen, int]] = []
+        for one in sorted(seen for seen in self._seen if start_m <= seen.odometer_m < stop_m):
+            lengths = next((length for end, length in self._turns if end >= one.odometer_m), self._turns[-1][1])
+            steps = np.array([lengths, 2 * lengths])
+            row = [(before, n) for before, n in row if one.odometer_m - before.odometer_m < MAX_ROW_STEP_M]
+            number = 1 + max(
+                (
+                    n
+                    for before, n in row
+                    if abs(one.lateral_m - before.lateral_m) < ROW_WIDTH_M
+                    and (abs(one.odometer_m - before.odometer_m - steps) < TURN_ERROR * steps).any()
+                ),
+                default=0,
+            )
+            if number >= MIN_ROW:
+                return True
+            row.append((one, number))
+        return False
+
+
+def decode_trace(
+    trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCandidates | None = None, compare: bool = True
+) -> list[Finding]:
     """Findings of a whole trace.
 
     It is decoded from its beginning again as soon as its magnets have shown the clearance, so that all of it is judged
-    by that. Where they never do, no magnet is reported: iron would look like one at some clearance.
+    by that. Where they never do, no magnet is reported: iron would look like one at some clearance. Where a line may
+    have been taken for a wheel, or a wheel for a line, other explanations are compared, and the likeliest is reported.
     """
     wheels = learn_wheels(trace, bar)
-    state, found = estimate_state(trace, bar, wheels, candidates)
-    if not state.is_known:
-        return [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, OF_MAGNETS)]
-    decoder = MagnetDecoder(bar, candidates=candidates, state=state, wheels=wheels)
+    found, decoder = _decode(trace, bar, wheels, candidates)
+    others = [
+        other
+        for start_m, stop_m in (_ambiguous_pieces(decoder) if compare else [])
+        if (other := _likeliest(trace, bar, candidates, decoder, start_m, stop_m)) is not None
+    ]
+    if others and others[0].piece.start_m == -math.inf and others[0].piece.stop_m == math.inf:
+        found, decoder = others[0].found, others[0].decoder
+    elif others:
+        found, decoder = _decode(trace, bar, wheels.with_pieces([other.piece for other in others]), candidates)
+    return found
+
+
+def _decode(
+    trace: MagnetTrace, bar: MagnetometerBar, wheels: WheelNoiseCanceller, candidates: TagCandidates | None = None
+) -> tuple[list[Finding], _WholeDecoder]:
+    """Findings of a trace with the clearance that it shows, and the decoder that found them."""
+    decoder, found = _estimate(trace, bar, wheels, candidates)
+    if not decoder.state.is_known:
+        found = [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, OF_MAGNETS)]
+        return found, decoder
+    decoder = _WholeDecoder(bar, wheels, candidates, decoder.state)
     found = [finding for chunk in _chunks(trace) for finding in decoder.feed(chunk)]
-    return found + decoder.finish()
+    return found + decoder.finish(), decoder
+
+
+def _ambiguous_pieces(decoder: _WholeDecoder) -> list[tuple[float, float]]:
+    """Pieces of the road where a line may have been taken for a wheel's noise, or the reverse. [m]"""
+    count = max(round(decoder.driven_m / PIECE_M), 1)
+    edges = [-math.inf, *(decoder.driven_m * k / count for k in range(1, count)), math.inf]
+    return [piece for piece in pairwise(edges) if decoder.is_ambiguous(*piece)]
+
+
+class _Explanation(NamedTuple):
+    """Noise of the wheels over a piece of the road, and what was found with it."""
+
+    piece: Piece
+    found: list[Finding]
+    decoder: _WholeDecoder
+
+
+def _likeliest(
+    trace: MagnetTrace,
+    bar: MagnetometerBar,
+    candidates: TagCandidates | None,
+    decoder: _WholeDecoder,
+    start_m: float,
+    stop_m: float,
+) -> _Explanation | None:
+    """What explains a piece of the road better than the noise that was learnt on the way; None if nothing does.
+
+    Compared are noise that is the same in every turn, as some turns show it, and no noise at all: by the energy that
+    magnets explain, less that which none explains, which must be positive: what leaves that much is no explanation. The
+    share of magnets must not fall: over iron alone, all energies fall where noise is left in. Where magnets explain
+    all, nothing further is tried.
+    """
+    part = trace.between(decoder.time_s(start_m - AROUND_M), decoder.time_s(stop_m + AROUND_M))
+    reach_m = decoder.odometer_m(float(part.t_s[0])) if start_m > -math.inf else 0.0
+    wheels = learn_wheels(part, bar)
+    front, blocks = Preprocessor(bar), Blocks(bar.sensor_count)
+    front.feed(part)
+    front.take(blocks, final=True)
+    best, most = None, decoder.explained(start_m, stop_m)
+    for turns in (*wheels.constant_turns(blocks.s, blocks.yaw, blocks.x), None):
+        found, other = _decode(part, bar, wheels.with_pieces([Piece(-math.inf, math.inf, turns)]), candidates)
+        explained = other.explained(start_m - reach_m, stop_m - reach_m)
+        if explained[0] > max(MIN_GAIN * most[0], 0.0) and explained[1] >= most[1]:
+            piece = Piece(start_m, stop_m, turns.moved(reach_m) if turns else None)
+            best, most = _Explanation(piece, found, other), explained
+            if most[1] == 1:
+                break
+    return best
 
 
 def learn_wheels(trace: MagnetTrace, bar: MagnetometerBar) -> WheelNoiseCanceller:
@@ -314,13 +500,21 @@ def estimate_state(
     trace: MagnetTrace, bar: MagnetometerBar, wheels: WheelNoiseCanceller, candidates: TagCandidates | None = None
 ) -> tuple[MagnetState, list[Finding]]:
     """What the magnets of a trace share, and the findings up to where they have surely shown it."""
-    decoder = MagnetDecoder(bar, candidates=candidates, wheels=wheels)
+    decoder, found = _estimate(trace, bar, wheels, candidates)
+    return decoder.state, found
+
+
+def _estimate(
+    trace: MagnetTrace, bar: MagnetometerBar, wheels: WheelNoiseCanceller, candidates: TagCandidates | None
+) -> tuple[_WholeDecoder, list[Finding]]:
+    """A decoder that has come to where the clearance is sure, or to the end, and its findings."""
+    decoder = _WholeDecoder(bar, wheels, candidates)
     found: list[Finding] = []
     for chunk in _chunks(trace):
         found += decoder.feed(chunk)
         if decoder.state.is_sure:
-            return decoder.state, found
-    return decoder.state, found + decoder.finish()
+            return decoder, found
+    return decoder, found + decoder.finish()
 
 
 def _chunks(trace: MagnetTrace) -> Iterator[MagnetTrace]:

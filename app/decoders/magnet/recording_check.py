@@ -234,7 +234,7 @@ def _sure(findings: Sequence[Finding]) -> list[MagnetReading]:
 
 
 def _sure_magnets(trace: MagnetTrace, bar: MagnetometerBar, candidates: TagCandidates | None) -> list[MagnetReading]:
-    return _sure(decode_trace(trace, bar, candidates=candidates))
+    return _sure(decode_trace(trace, bar, candidates=candidates, compare=False))
 
 
 def _strength(magnets: Sequence[MagnetReading]) -> float:

@@ -11,13 +11,15 @@ Shapes: W wheels, S sensors, L trial circumferences, H harmonics by which the tu
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from app.compiled import kernel, routine
-from app.values import Floats, Ints
+from app.values import Bools, Floats, Ints
 
 # Distances over which the filter learns, in turns of some two metres, and limits of what a wheel can be like. They were
 # chosen where no measurement stands beside them. `python -m benchmarks.magnets wheel drawn` checks them: the passes of
@@ -76,6 +78,18 @@ MIN_STRANGE = 0.3
 GATE_OPENS, GATE_M = 0.8, 2.0  # [1, m] share of every limit below which noise is taken out again; distance of fading
 
 
+# What is the same in every turn (`WheelNoiseCanceller.constant_turns`).
+FIRST_TURNS, MIN_TURNS = 4, 3
+"""Turns in a row from which on like ones are searched, and fewest that are alike. Source: a line may begin 8 m after a
+recording, where its wheels are known."""
+PRICE = 5.0
+"""Log likelihood of something else in a turn, above that of noise, from which on it counts as there. With 10 turns over
+lines beyond the bar's ends pass for turns without."""
+MAX_ROUNDS, POWER_ROUNDS = 20, 4  # of the search, and of the estimate of a wheel's strength
+SAME_SHARE = 0.7  # of turns in common, from which on two results are the same
+FIRST_POWER_UT2, MIN_VARIANCE_UT2 = 50.0, 1e-3  # [uT2] of a wheel's harmonics at its reference, at first and at least
+
+
 class _Progress:
     """How far a drive has come: a record, of whose fields these are names and types."""
 
@@ -85,6 +99,7 @@ class _Progress:
     driven_m: float
     errors_known: bool  # deviations of the residuals were estimated beforehand
     is_strange: bool  # what was learnt cannot be a wheel's
+    held_back_m: float  # for which that was so
     gate: float  # how much of the noise is taken out: it falls to 0 while that is so
 
 
@@ -138,6 +153,42 @@ class _Limits(NamedTuple):
     beside: Ints  # (S, 2) these sensors, -1 where a wheel may be as loud
 
 
+class ConstantTurns:
+    """Noise of wheels that is the same in every turn, of a stretch of road.
+
+    Parameters
+    ----------
+    s : ndarray, shape (N,)
+        Odometers. [m]
+    phases : ndarray, shape (N, W)
+        Of the wheels there, unwrapped. [rad]
+    weights : ndarray, shape (S, 3, 2 W HARMONICS)
+        Cosine and sine of each harmonic. [uT]
+    """
+
+    def __init__(self, s: Floats, phases: Floats, weights: Floats) -> None:
+        self._s = s
+        self._phases = phases
+        self._weights = weights
+
+    def noise_ut(self, s: Floats) -> Floats:
+        """The noise of each sensor at odometers s (N,), shape (N, S, 3). [uT]"""
+        phases = np.array([np.interp(s, self._s, of_wheel) for of_wheel in self._phases.T]).T
+        return np.asarray(np.einsum("nk,sak->nsa", _regressors(phases), self._weights))
+
+    def moved(self, by_m: float) -> ConstantTurns:
+        """The same where odometers are larger. [m]"""
+        return ConstantTurns(self._s + by_m, self._phases, self._weights)
+
+
+class Piece(NamedTuple):
+    """A piece of the road, and what the wheels' noise is there: the same in every turn, or nothing."""
+
+    start_m: float
+    stop_m: float
+    turns: ConstantTurns | None
+
+
 class WheelNoiseCanceller:
     """Takes wheel noise out of blocks, in their order.
 
@@ -179,14 +230,41 @@ class WheelNoiseCanceller:
         )
         self._limits = _wheel_limits(positions_m, references)
         self._progress = np.zeros(1, _PROGRESS)
+        self._pieces: tuple[Piece, ...] = ()
+
+    def with_pieces(self, pieces: Sequence[Piece]) -> WheelNoiseCanceller:
+        """A copy that takes out, over some pieces of the road, what was found for them."""
+        copy = deepcopy(self)
+        copy._pieces = tuple(pieces)
+        return copy
+
+    @property
+    def held_back_m(self) -> float:
+        """Distance over which nothing was taken out, because what was learnt cannot be a wheel's. [m]"""
+        return float(self._progress["held_back_m"][0])
+
+    @property
+    def lengths_m(self) -> Floats:
+        """Length of a turn of each wheel that is noisy at present. [m]"""
+        return np.asarray(self._turns.length_m[self._turns.locked_m > 0])
 
     def cancel(self, s: Floats, yaw: Floats, x: Floats) -> None:
         """Take the noise out of blocks at odometers s and yaw (N,), anticlockwise: x (N, S, 3), in place. [m, rad, uT]
 
         In a bend, a wheel rolls less by the change of yaw times how far to the left of the middle it is.
         """
-        if self._turns.references.size and s.size:
-            _cancel(s, yaw, x, self._turns, self._channels, self._limits, self._progress[0])
+        before = [x[(s >= p.start_m) & (s < p.stop_m)] for p in self._pieces]
+        self._follow(s, yaw, x)
+        for piece, field in zip(self._pieces, before, strict=True):
+            at = (s >= piece.start_m) & (s < piece.stop_m)
+            x[at] = field - piece.turns.noise_ut(s[at]) if piece.turns else field
+
+    def _follow(self, s: Floats, yaw: Floats, x: Floats) -> Floats:
+        """Take out what is learnt on the way; the phases of the turns (N, W)."""
+        phases = np.zeros((s.size, self._turns.references.size))
+        if phases.size:
+            _cancel(s, yaw, x, phases, self._turns, self._channels, self._limits, self._progress[0])
+        return phases
 
     def learn_beginning(self, s: Floats, yaw: Floats, x: Floats) -> None:
         """Learn the noise of the first blocks of a recording (as for `cancel`), forwards and back; x stays as it is.
@@ -203,10 +281,7 @@ class WheelNoiseCanceller:
 
     def _estimate_errors(self, s: Floats, x: Floats) -> None:
         """Set the deviations of the residuals by the median, in which the few blocks over magnets do not count."""
-        from scipy.ndimage import uniform_filter1d  # takes memory, and streams do not need it
-
-        blocks = math.ceil(SMOOTH_M / max(float(s[-1] - s[0]) / s.size, MIN_STEP_M))
-        median = np.median(abs(x - uniform_filter1d(x, blocks, axis=0)), axis=0)
+        median = np.median(abs(_without_offset(s, x)), axis=0)
         self._channels.error[:] = np.maximum(MEDIAN_DEVIATION * median, MIN_ERROR_UT)
         self._progress["errors_known"] = True
 
@@ -223,6 +298,132 @@ class WheelNoiseCanceller:
         self._turns.pending_ut_m[:] = 0.0
         self._progress["odometer_m"] *= -1.0
         self._progress["yaw_rad"] *= -1.0
+
+    def constant_turns(self, s: Floats, yaw: Floats, x: Floats) -> list[ConstantTurns]:
+        """Noise that a stretch of road can have in every turn, that of which most turns are alike first.
+
+        A wheel's noise is the same in all turns, those before a line and after it included; a line begins and ends. So
+        the turns that are alike but for the chips' noise are searched, from a few of them on, and the harmonics are
+        fitted to these alone.
+
+        Parameters
+        ----------
+        s, yaw, x
+            Blocks of the stretch, as for `cancel`; they stay as they are. [m, rad, uT]
+        """
+        phases = np.unwrap(deepcopy(self)._follow(s, yaw, x.copy()), axis=0)
+        if not phases.size or phases[-1, 0] - phases[0, 0] < 2 * math.pi * (3 * FIRST_TURNS):
+            return []
+        field = _without_offset(s, x)
+        variance = np.median(abs(np.diff(field, axis=0)), axis=0) ** 2 * (MEDIAN_DEVIATION**2 / 2)
+        near, references = self._channels.near, self._turns.references
+        turn = np.maximum.accumulate(((phases[:, 0] - phases[0, 0]) / (2 * math.pi)).astype(np.int64))
+        turn = np.unique(turn, return_inverse=True)[1]
+        turns = _fourier_turns(phases, field / np.sqrt(np.maximum(variance, MIN_VARIANCE_UT2)), near, turn)
+        turns[:, references] = 0.0
+        alike: list[Bools] = []
+        for first in _first_turns(turns):
+            same = _alike(turns, first, 3 * (len(near) - references.size))
+            if not any((same & other).sum() > SAME_SHARE * (same | other).sum() for other in alike):
+                alike.append(same)
+        found = []
+        for same in sorted(alike, key=lambda one: -int(one.sum())):
+            here = np.append(same, False)[turn]
+            weights = _fit_turns(phases[here], field[here], variance, near, references)
+            found.append(ConstantTurns(s, phases, weights))
+        return found
+
+
+def _without_offset(s: Floats, x: Floats) -> Floats:
+    """Field less its moving mean over `SMOOTH_M`."""
+    from scipy.ndimage import uniform_filter1d  # takes memory, and streams do not need it
+
+    blocks = math.ceil(SMOOTH_M / max(float(s[-1] - s[0]) / s.size, MIN_STEP_M))
+    return np.asarray(x - uniform_filter1d(x, blocks, axis=0))
+
+
+def _regressors(phases: Floats) -> Floats:
+    """Cosine and sine of each harmonic, wheel by wheel, at phases (N, W): shape (N, 2 W HARMONICS)."""
+    angles = phases[:, :, None] * np.arange(1, HARMONICS + 1)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=3).reshape(len(phases), 2 * HARMONICS * phases.shape[1])
+
+
+def _fourier_turns(phases: Floats, x: Floats, near: Floats, turn: Ints) -> Floats:
+    """Fourier series of x (N, S, 3), in deviations, over each turn, in the phases of the wheel nearest to each sensor.
+
+    The result has the shape (T, S, 3, 2 HARMONICS); each value has the variance 1 where there is nothing but noise. A
+    turn at the end that is not complete is left out.
+    """
+    starts = np.flatnonzero(np.diff(turn, prepend=-1))
+    count = np.diff(np.append(starts, turn.size))
+    out = np.zeros((starts.size, *x.shape[1:], 2 * HARMONICS))
+    for w in range(phases.shape[1]):
+        sensors = np.flatnonzero(near.argmax(axis=1) == w)
+        regressors = _regressors(phases[:, w : w + 1])
+        for k in range(2 * HARMONICS):
+            out[..., k][:, sensors] = np.add.reduceat(regressors[:, k, None, None] * x[:, sensors], starts, axis=0)
+    return out[:-1] * np.sqrt(2 / count[:-1, None, None, None])
+
+
+def _first_turns(turns: Floats) -> list[Bools]:
+    """Few turns in a row from which on like ones are searched: those with the least energy, the first and the last.
+
+    Magnets and iron add to the energy, but a line can be in opposite phase to a wheel for a while.
+    """
+    rows = turns.reshape(len(turns), -1)
+    window = np.lib.stride_tricks.sliding_window_view(rows, FIRST_TURNS, axis=0)
+    mean = window.mean(axis=2)
+    energy = (mean**2).sum(axis=1) + window.var(axis=2, ddof=1).sum(axis=1)
+    found = []
+    for start in (int(np.argmin(energy)), 1, len(rows) - FIRST_TURNS - 1):
+        of = np.zeros(len(rows), np.bool_)
+        of[start : start + FIRST_TURNS] = True
+        found.append(of)
+    return found
+
+
+def _alike(turns: Floats, first: Bools, channels: int) -> Bools:
+    """Turns (T,) that differ from the mean of all such turns by no more than noise.
+
+    The log likelihood ratio of a channel with more energy than noise, of its own size, is h (r - 1 - log r) for h
+    harmonics and r times the energy of noise; of noise it has the mean h (log h - digamma(h)), about one half.
+    """
+    from scipy.special import digamma  # takes memory, and streams do not need it
+
+    of_noise = channels * HARMONICS * (math.log(HARMONICS) - float(digamma(HARMONICS)))
+    same = first
+    for _ in range(MAX_ROUNDS):
+        count = int(same.sum())
+        energy = ((turns - turns[same].mean(axis=0)) ** 2).mean(axis=3)
+        ratio = energy / np.where(same, 1 - 1 / count, 1 + 1 / count)[:, None, None]
+        gain = HARMONICS * (ratio - 1 - np.log(np.maximum(ratio, 1e-9)))
+        renewed = np.where(ratio > 0, gain, 0.0).sum(axis=(1, 2)) < of_noise + PRICE
+        if renewed.sum() < MIN_TURNS or (renewed == same).all():
+            break
+        same = renewed
+    return same
+
+
+def _fit_turns(phases: Floats, x: Floats, variance: Floats, near: Floats, references: Ints) -> Floats:
+    """Weights (S, 3, 2 W HARMONICS) by least squares, each wheel's shrunk by what it can have at a sensor.
+
+    The variance of the weights at a wheel's reference follows from them; elsewhere it falls as in `_nearness`.
+    """
+    wheels = near.shape[1]
+    regressors = _regressors(phases)
+    normal = regressors.T @ regressors
+    right = np.einsum("nk,nsa->ska", regressors, x)
+    power = np.full(wheels, FIRST_POWER_UT2)
+    weights = np.zeros((*x.shape[1:], regressors.shape[1]))
+    for _ in range(POWER_ROUNDS):
+        for j in range(len(near)):
+            noise = float(variance[j].mean()) + MIN_VARIANCE_UT2
+            expected = np.repeat(noise / (power * near[j] + 1e-9), 2 * HARMONICS)
+            weights[j] = np.linalg.solve(normal + np.diag(expected), right[j]).T
+        for w in range(wheels):
+            own = weights[references[w], :, 2 * HARMONICS * w : 2 * HARMONICS * (w + 1)]
+            power[w] = max(float((own**2).mean()), MIN_VARIANCE_UT2)
+    return weights
 
 
 def _nearness(positions_m: Floats, references: npt.NDArray[np.intp]) -> Floats:
@@ -257,10 +458,18 @@ def _wheel_limits(positions_m: Floats, references: npt.NDArray[np.intp]) -> _Lim
 
 @kernel
 def _cancel(
-    s: Floats, yaw: Floats, x: Floats, turns: _Turns, channels: _Channels, limits: _Limits, progress: _Progress
+    s: Floats,
+    yaw: Floats,
+    x: Floats,
+    phases: Floats,
+    turns: _Turns,
+    channels: _Channels,
+    limits: _Limits,
+    progress: _Progress,
 ) -> None:
-    """Follow the turns, take the noise out of each block and learn from what is left."""
+    """Follow the turns, whose phases (N, W) are put out, take the noise out of each block and learn from the rest."""
     for i in range(s.size):
+        phases[i] = turns.phase
         if not progress.has_begun:
             progress.has_begun = True
             progress.odometer_m = s[i]
@@ -278,6 +487,7 @@ def _cancel(
         for w in range(turns.references.size):
             rolled_m = min(max(step - turns.left_m[w] * turned, 0.0), 2 * step)
             _follow_turn(w, rolled_m, progress.driven_m, x[i], turns, channels)
+        phases[i] = turns.phase
         locked_m = turns.locked_m.max()
         if locked_m > 0:
             _set_gate(step, _strangeness(channels, limits), progress)
@@ -403,6 +613,8 @@ def _set_gate(step: float, strangeness: float, progress: _Progress) -> None:
 
     It is then also of the magnets of a line, as far apart as a turn is long.
     """
+    if progress.is_strange:
+        progress.held_back_m += step
     if strangeness > 1:
         progress.is_strange = True
     elif strangeness < GATE_OPENS:

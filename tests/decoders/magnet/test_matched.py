@@ -342,6 +342,21 @@ def test_a_line_as_far_apart_as_a_turn_is_long_is_never_taken_out_as_the_noise_o
     assert right >= 60
 
 
+@pytest.mark.parametrize(
+    ("turns", "lateral_m", "length_m"), [(1.0, 0.8, 110.0), (0.99, -0.75, 110.0), (2.0, 0.8, 110.0), (1.0, 0.8, 94.0)]
+)
+def test_a_line_under_the_end_of_a_high_bar_is_not_a_wheel(turns: float, lateral_m: float, length_m: float) -> None:
+    turn_m = turns * 2 * np.pi * Wheel((0.0, 0.0, 0.0)).radius_m
+    lines = line_magnets(14, 94, turn_m, lateral_m, Polarity.N)  # the last drive ends with it
+    vehicle = Vehicle.compact(clearance_m=0.33, wheel_moment_am2=0.4)
+    drive = simulate_drive(
+        Scene(Road(length_m), vehicle, Course(13.0, weave_m=0.02), lines=lines), np.random.default_rng(5)
+    )
+    right, other = right_and_other(drive, decode_trace(drive.trace, BAR))
+    assert other == 0  # 12, 0, 10 and 0 with what is learnt on the way alone
+    assert right >= len(drive.magnets) - 1  # 1, 0, 21 and 0 with that
+
+
 @pytest.mark.slow
 def test_tags_beside_a_line_are_read_although_their_fields_merge_with_it() -> None:
     tag = InformationTag.from_gaps("SNS", 0.5, (1, 7))  # two opposed magnets half a metre apart

@@ -9,7 +9,7 @@ import pytest
 
 from app.decoders.magnet.preprocess import Blocks, Preprocessor
 from app.decoders.magnet.readings import VehiclePath
-from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
+from app.decoders.magnet.wheel_noise import Piece, WheelNoiseCanceller
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
 BAR = MagnetometerBar.metro()
@@ -156,6 +156,38 @@ def test_of_a_whole_recording_the_noise_is_known_from_its_beginning() -> None:
     canceller.cancel(s, yaw, x)
     first = slice(1, int(np.searchsorted(s, 10)))
     assert x[first, :3].std() < 0.2 * noise[first, :3].std()
+
+
+@pytest.mark.parametrize("turns", [1.0, 0.99, 2.0])
+def test_noise_that_is_the_same_in_every_turn_is_not_that_of_a_line(turns: float) -> None:
+    rng = np.random.default_rng(7)
+    s, yaw = np.arange(0, 120, 0.03), np.zeros(4000)
+    noise = wheel_noise(s / LENGTH_M, rng)
+    line = np.zeros_like(noise)
+    for at in np.arange(20, 105, turns * LENGTH_M):
+        line[:, :3, 2] += 20 * np.exp(-(((s - at) / 0.2) ** 2))[:, None]
+    x = noise + line + rng.normal(0, 0.5, noise.shape)
+    kept = x.copy()
+    canceller = WheelNoiseCanceller(np.array([3]), PLACES_M)
+    canceller.learn_beginning(s, yaw, x)
+    found = canceller.constant_turns(s, yaw, x)
+    np.testing.assert_array_equal(x, kept)
+    over = (s > 25) & (s < 100)
+    off = [float((one.noise_ut(s) - noise)[over, :3].std()) for one in found]
+    assert min(off) < 0.06 * noise[over, :3].std()
+    pieces = [Piece(30.0, 60.0, found[int(np.argmin(off))]), Piece(60.0, 90.0, None)]
+    canceller.with_pieces(pieces).cancel(s, yaw, x)
+    np.testing.assert_array_equal(x[(s >= 60) & (s < 90)], kept[(s >= 60) & (s < 90)])
+    left = (x - line)[(s >= 30) & (s < 60), :3]
+    assert left.std() < 0.2 * noise[over, :3].std()
+
+
+def test_a_short_stretch_shows_no_noise_that_is_the_same_in_every_turn() -> None:
+    s = np.arange(0, 20, 0.03)
+    x = wheel_noise(s / LENGTH_M, np.random.default_rng(8))
+    canceller = WheelNoiseCanceller(np.array([3]), PLACES_M)
+    assert canceller.constant_turns(s, np.zeros_like(s), x) == []
+    assert canceller.constant_turns(s[:0], s[:0], x[:0]) == []
 
 
 def test_without_references_nothing_is_changed() -> None:
