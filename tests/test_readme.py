@@ -129,7 +129,7 @@ def test_pictures_of_tutorials_are_small_and_shown() -> None:
 
 
 def test_tables_state_the_decoder_that_made_them_and_none_mixes_versions() -> None:
-    text = stamp_sections("### trials\n\n| a |\n", "plate/9") + stamp_sections("### recall\n\n| b |\n", "matched-9")
+    text = stamp_sections("### trials\n\n| a |\n", "plate/8") + stamp_sections("### recall\n\n| b |\n", "matched-9")
     page = fill_blocks(
         "<!-- bench:trials -->\n<!-- /bench -->\n<!-- bench:recall -->\n<!-- /bench -->", read_sections(text)
     )

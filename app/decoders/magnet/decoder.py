@@ -89,7 +89,7 @@ ROAD_STEP = 25  # [blocks] of which one odometer is kept: half a metre
 MIN_ROW, TURN_ERROR, ROW_WIDTH_M, MAX_ROW_STEP_M = 4, 0.02, 0.2, 5.0
 """Dipoles in a row at one or two turns of a wheel, from which on they may be a line that was learnt, or a wheel; share
 of a turn by which they may be off, distance across, and longest step. [1, 1, m, m] Source: of lines that are 2 % off,
-magnets were lost at 33 cm, of those 2.5 % off few (decision 0014)."""
+magnets were lost at 33 cm, of those 2.5 % off few (decision 0029)."""
 
 
 OTHER_WEIGHT = 5.0
