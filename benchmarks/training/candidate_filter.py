@@ -7,7 +7,6 @@ others. Candidates on a plate that do not lead to a fit count neither way.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +33,7 @@ from benchmarks.plates.sets import Job, Shot, shoot
 from benchmarks.plates.tables import table
 from benchmarks.plates.views import read_photos
 from benchmarks.scenes.places import draw_place, scene_under
+from benchmarks.training import read_arguments
 
 Image = npt.NDArray[np.uint8]
 
@@ -164,13 +164,10 @@ def roc_rows(log_odds: Floats, is_plate: npt.NDArray[np.bool_], limits: Sequence
 
 def main() -> None:
     """Learn, and print coefficients and ROC."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.training.candidate_filter", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="to learn from; the next one is for the ROC")
-    parser.add_argument("--frames", type=int, default=300, help="with plates, and as many without, of each seed")
-    args = parser.parse_args()
+    seed, frames = read_arguments("candidate_filter", __doc__, 1, "frames", 300)
     cv2.setNumThreads(1)
-    weights = regress(*collect(args.seed, args.frames))
-    features, is_plate = collect(args.seed + 1, args.frames)
+    weights = regress(*collect(seed, frames))
+    features, is_plate = collect(seed + 1, frames)
     names = (*FEATURES, "constant")
     print("\n".join(f"    {weight:.3f},  # {name}" for name, weight in zip(names, weights, strict=True)))
     log_odds = features @ weights[:-1] + weights[-1]
@@ -179,7 +176,7 @@ def main() -> None:
     ranks[order] = np.arange(1, len(order) + 1)
     plates = int(is_plate.sum())
     area = (ranks[is_plate].sum() - plates * (plates + 1) / 2) / max(plates * (len(is_plate) - plates), 1)
-    print(f"\nROC on seed {args.seed + 1}: area under the curve {area:.4f}\n")
+    print(f"\nROC on seed {seed + 1}: area under the curve {area:.4f}\n")
     limits = [-math.inf, *range(-7, 3)]
     print(table(("log odds", "plates lost", "others kept"), roc_rows(log_odds, is_plate, limits)))
 

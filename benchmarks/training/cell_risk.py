@@ -7,9 +7,7 @@ compared with what the cells show, beside those of the decoder.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -34,6 +32,7 @@ from app.simulation.plate_scene import face_truth
 from app.values import Floats
 from benchmarks.plates.schemes import CANDIDATES, SCHEME_SETS, draw_drive, list_drives
 from benchmarks.plates.tables import table
+from benchmarks.training import read_arguments, reliability_rows
 from benchmarks.training.candidate_filter import regress
 
 FEATURES = ("level residual", "misfit", "beside a hidden marker")
@@ -78,32 +77,19 @@ def risks(features: Floats, weights: Floats) -> Floats:
     return np.asarray(1 / (1 + np.exp(-features @ weights[:-1] - weights[-1])))
 
 
-def reliability_rows(
-    risk: Floats, wrong: npt.NDArray[np.bool_], edges: Sequence[float]
-) -> Iterator[tuple[object, ...]]:
-    """Cells by their predicted risk: their number, mean risk, and share that shows another symbol."""
-    for low, high in pairwise(edges):
-        inside = (risk >= low) & (risk < high)
-        if inside.any():
-            yield f"{low:g} to {high:g}", int(inside.sum()), f"{risk[inside].mean():.3f}", f"{wrong[inside].mean():.3f}"
-
-
 def main() -> None:
     """Learn, and print the coefficients and how reliable they are."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.training.cell_risk", description=__doc__)
-    parser.add_argument("--seed", type=int, default=11, help="to learn from; the next one is for the comparison")
-    parser.add_argument("--drives", type=int, default=3, help="of each set of light, dirt and weather")
-    args = parser.parse_args()
+    seed, drives = read_arguments("cell_risk", __doc__, 11, "drives", 3)
     cv2.setNumThreads(1)
-    learnt = regress(*collect(args.seed, args.drives))
-    features, wrong = collect(args.seed + 1, args.drives)
+    learnt = regress(*collect(seed, drives))
+    features, wrong = collect(seed + 1, drives)
     names = (*FEATURES, "constant")
     rows = [(name, f"{new:.3f}", f"{old:.3f}") for name, new, old in zip(names, learnt, DECODER, strict=True)]
     print(table(("coefficient", "learnt", "of the decoder"), rows))
     for name, weights in (("learnt", learnt), ("of the decoder", DECODER)):
         risk = np.clip(risks(features, weights), 1e-9, 1 - 1e-9)
         loss = -np.where(wrong, np.log(risk), np.log(1 - risk)).mean()
-        print(f"\n{name}: a loss of {loss:.3f} nats a cell on seed {args.seed + 1}\n")
+        print(f"\n{name}: a loss of {loss:.3f} nats a cell on seed {seed + 1}\n")
         print(table(("risk", "cells", "mean risk", "wrong"), reliability_rows(risk, wrong, EDGES)))
 
 

@@ -14,7 +14,6 @@ import multiprocessing
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +39,7 @@ from benchmarks.hunt.magnet import simulate_scene
 from benchmarks.magnets.drawn_scenes import draw_iron_drive, draw_line_beside_tags, draw_magnets_drive
 from benchmarks.magnets.score import REACH_M
 from benchmarks.plates.tables import table
+from benchmarks.training import reliability_rows
 
 IRON_SHARE, IRON_LENGTH_M = 0.25, 1200.0
 """[1, m] drives over iron and a few magnets among all, and their length."""
@@ -181,12 +181,7 @@ def main() -> None:
     true = right[test]
     rows = [(p, int(true[odds >= p].sum()), int(true.sum()), int((~true[odds >= p]).sum())) for p in THRESHOLDS]
     print(table(("from probability", "right", "of", "wrong"), rows))
-    calibration = [
-        (f"{low:g} to {high:g}", int(one.sum()), f"{odds[one].mean():.4f}", f"{true[one].mean():.4f}")
-        for low, high in pairwise(BINS)
-        if (one := (odds >= low) & (odds < high)).any()
-    ]
-    print(table(("probability", "dipoles", "mean", "right"), calibration))
+    print(table(("probability", "dipoles", "mean", "right"), reliability_rows(odds, true, BINS)))
 
 
 if __name__ == "__main__":

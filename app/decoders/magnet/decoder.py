@@ -92,7 +92,7 @@ of a turn by which they may be off, distance across, and longest step. [1, 1, m,
 magnets were lost at 33 cm, of those 2.5 % off few (decision 0029)."""
 
 
-OTHER_WEIGHT = 5.0
+NO_MAGNET_WEIGHT = 5.0
 """[1] of energy that no magnet explains, against that of magnets. Source: where a line covers a whole recording, what
 is left of magnets that were taken out is often another magnet (seeds 7701 and 9301 of lines of one turn at 33 cm)."""
 
@@ -103,7 +103,7 @@ each explanation's own noise, which differs by a seventh where they explain the 
 lines that were taken for wheels, the gain is two and more."""
 
 
-class Seen(NamedTuple):
+class StrongDipole(NamedTuple):
     """Where a strong dipole lies, and the energy it explains: negative under the bar if it is no magnet, 0 beside."""
 
     odometer_m: float
@@ -329,7 +329,7 @@ class _WholeDecoder(MagnetDecoder):
         state: MagnetState | None = None,
     ) -> None:
         super().__init__(bar, candidates=candidates, state=state, wheels=wheels)
-        self._seen: list[Seen] = []
+        self._strong: list[StrongDipole] = []
         self._road: list[Floats] = []  # odometer and time (N, 2), about every half metre
         self._held_back: list[tuple[float, float]] = []  # stretches where the wheels' noise was not taken out
         self._turns: list[tuple[float, Floats]] = []  # odometer and the lengths of a turn of the noisy wheels
@@ -347,7 +347,7 @@ class _WholeDecoder(MagnetDecoder):
         reading = super()._reading(dipole, classification)
         if dipole.explained >= POLE_ENERGY:
             sign = 1 if isinstance(reading, MagnetReading) else -int(is_strong(dipole, self._array.half_width_m))
-            self._seen.append(Seen(reading.odometer_m, reading.lateral_cm / 100, sign * dipole.explained))
+            self._strong.append(StrongDipole(reading.odometer_m, reading.lateral_cm / 100, sign * dipole.explained))
         return reading
 
     @property
@@ -367,9 +367,9 @@ class _WholeDecoder(MagnetDecoder):
 
     def explained(self, start_m: float, stop_m: float) -> tuple[float, float]:
         """Energy of the magnets in a piece of the road less that of what is none by its weight, and their share."""
-        here = np.array([one.explained for one in self._seen if start_m <= one.odometer_m < stop_m])
+        here = np.array([one.explained for one in self._strong if start_m <= one.odometer_m < stop_m])
         magnets, others = float(here[here > 0].sum()), float(-here[here < 0].sum())
-        return magnets - OTHER_WEIGHT * others, magnets / max(magnets + others, POLE_ENERGY)
+        return magnets - NO_MAGNET_WEIGHT * others, magnets / max(magnets + others, POLE_ENERGY)
 
     def is_ambiguous(self, start_m: float, stop_m: float) -> bool:
         """Whether a line may have been taken for a wheel in a piece of the road, or a wheel for a line.
@@ -378,8 +378,8 @@ class _WholeDecoder(MagnetDecoder):
         """
         if any(first < stop_m and last >= start_m for first, last in self._held_back):
             return True
-        row: list[tuple[Seen, int]] = []
-        for one in sorted(seen for seen in self._seen if start_m <= seen.odometer_m < stop_m):
+        row: list[tuple[StrongDipole, int]] = []
+        for one in sorted(seen for seen in self._strong if start_m <= seen.odometer_m < stop_m):
             lengths = next((length for end, length in self._turns if end >= one.odometer_m), self._turns[-1][1])
             steps = np.array([lengths, 2 * lengths])
             row = [(before, n) for before, n in row if one.odometer_m - before.odometer_m < MAX_ROW_STEP_M]

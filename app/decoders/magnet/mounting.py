@@ -2,8 +2,8 @@
 
 A magnet is a dipole, and so is much of the iron in a road. In the right mounting a dipole explains the field of an
 event but for the errors of the sensors, in a wrong one it does not, wherever the dipole is and its moment points. So a
-fault is likely where events that are no dipoles as declared become dipoles with it. What is no dipole in either, like
-merged magnets and large iron, says nothing, and neither does the absence of a field.
+fault is likely where events that are no dipoles as declared become dipoles with it. Events that are no dipole in either
+mounting, such as merged magnets and large iron, are ignored, and so is the absence of a field.
 
 A dipole cannot show everything: all signs inverted is a dipole of the other polarity, and left and right exchanged with
 y inverted a mirrored road. The earth's field while the vehicle turns, with its headings, shows which it is.

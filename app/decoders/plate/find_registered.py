@@ -1,9 +1,9 @@
 """Registered plates that a frame shows without the colours of their markers: under snow, mirrored lights or motion.
 
-The mount of the camera says how the road lies before it, so that a plate has a known size in a view of the road from
-above. There it is sought where the road is busier than around, and compared with the patterns of the plates that the
-registry knows nearby: the logarithm of the light, without its slow changes, correlated with each pattern. The best
-match is fitted, and its units must show the code as those of any plate do whose colours are missing (`evidence`).
+The height and the angles of the camera give a bird's-eye view of the road, in which a plate has a known size. Squares
+of that size with more edges than the road around them are compared with the patterns of the plates that are registered
+nearby: the logarithm of the light, without its slow changes, is correlated with each pattern. The best match is fitted,
+and its units must confirm the code, as those of any plate whose colours are missing (`evidence`).
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ MIN_LIKENESS, MAX_FITTED = 0.4, 2
 place decide. Source: of plates in snow, sand and dusk and on wet roads, 95 % have more than 0.49."""
 
 
-class Likely(NamedTuple):
+class LikelyPlate(NamedTuple):
     """A place of a frame that looks like a registered plate."""
 
-    likeness: float  # correlation with its pattern
+    geometry: PlateGeometry
     corners_px: Floats  # shape (4, 2), clockwise from the triangle's
     tries: int  # shifts, turns and lengths of which this is the best
 
@@ -67,7 +67,7 @@ class _RoadView:
             height, width = (side // 2 for side in self._levels[-1].shape)
             half = cv2.resize(self._levels[-1], (width, height), interpolation=cv2.INTER_AREA)
             self._levels.append(np.asarray(half, np.float32))
-        self._camera = camera
+        self.camera = camera
         self._from_road = camera.camera_from_vehicle
         self._lens_m = -self._from_road[:, 2] * camera.height_m  # of the road below the camera, in the camera's frame
 
@@ -75,8 +75,8 @@ class _RoadView:
         """Images of points of the road, shape (N, 2), forward and left of the camera [m]; far outside behind it."""
         in_camera = road_m @ self._from_road[:, :2].T + self._lens_m
         image_px = np.full((len(road_m), 2), -1e4)
-        ahead = in_camera[:, 2] > 0.1 * self._camera.height_m
-        image_px[ahead] = self._camera.project(in_camera[ahead])
+        ahead = in_camera[:, 2] > 0.1 * self.camera.height_m
+        image_px[ahead] = self.camera.project(in_camera[ahead])
         return image_px
 
     def sample(self, road_from_view: Floats, width: int, height: int, *, per_sample_px: float, step: int) -> Floats32:
@@ -113,7 +113,7 @@ def _interpolation(size: int, step: int) -> Floats:
 
 def find_registered(
     image: Array, camera: Camera, codebook: Sequence[PlateCode], geometries: Sequence[PlateGeometry]
-) -> Iterator[tuple[PlateGeometry, Likely]]:
+) -> Iterator[LikelyPlate]:
     """Places of a frame that look like a registered plate, the most alike first.
 
     Parameters
@@ -132,19 +132,19 @@ def find_registered(
     matches: list[tuple[PlateGeometry, Sequence[PlateCode], _Match]] = []
     for geometry in geometries:
         codes = [code for code in codebook[:MAX_CODES] if code.n == geometry.n]
-        for middle_m in _busy_places(view, camera, geometry) if codes else ():
-            matches.append((geometry, codes, _match(view, camera, geometry, codes, _Place(middle_m), COARSE)))
+        for middle_m in _busy_places(view, geometry) if codes else ():
+            matches.append((geometry, codes, _match(view, geometry, codes, _Place(middle_m), COARSE)))
     for geometry, known, coarse in sorted(matches, key=lambda one: -one[2].likeness)[:MAX_FITTED]:
         if coarse.likeness < MIN_LIKENESS:
             break
-        fine = _match(view, camera, geometry, [known[coarse.code]], coarse.place, FINE)
+        fine = _match(view, geometry, [known[coarse.code]], coarse.place, FINE)
         road_from_plate = fine.place.from_samples(geometry.side_mm / 1000, 1)
-        yield geometry, Likely(coarse.likeness, view.project((_CORNERS @ road_from_plate.T)[:, :2]), COARSE.tries)
+        yield LikelyPlate(geometry, view.project((_CORNERS @ road_from_plate.T)[:, :2]), COARSE.tries)
 
 
-def _busy_places(view: _RoadView, camera: Camera, geometry: PlateGeometry) -> list[Floats]:
+def _busy_places(view: _RoadView, geometry: PlateGeometry) -> list[Floats]:
     """Where the road has more edges than around, in both directions: forward and left, shape (2,). [m]"""
-    side_m = geometry.side_mm / 1000
+    side_m, camera = geometry.side_mm / 1000, view.camera
     box = round(side_m / ROAD_M)
     far_m = min(math.sqrt(camera.fy_px * camera.height_m * side_m / geometry.n / MIN_UNIT_ROWS), FARTHEST_M)
     found: list[tuple[float, Floats]] = []
@@ -226,15 +226,13 @@ class _Match(NamedTuple):
 _CORNERS = np.array([(-0.5, -0.5, 1), (0.5, -0.5, 1), (0.5, 0.5, 1), (-0.5, 0.5, 1)])  # [plate sides] from its middle
 
 
-def _match(
-    view: _RoadView, camera: Camera, geometry: PlateGeometry, codes: Sequence[PlateCode], about: _Place, grid: _Grid
-) -> _Match:
+def _match(view: _RoadView, geometry: PlateGeometry, codes: Sequence[PlateCode], about: _Place, grid: _Grid) -> _Match:
     """The best match of any code, of the shifts, turns and stretches of a grid; -1 outside the frame."""
     side = geometry.n * grid.samples
     width = side + 2 * grid.reach * grid.samples
     sample_m = geometry.side_mm / 1000 / side
-    distance2_m2 = about.middle_m[0] ** 2 + camera.height_m**2
-    per_sample_px = camera.fy_px * camera.height_m * sample_m / distance2_m2 / 1.5
+    distance2_m2 = about.middle_m[0] ** 2 + view.camera.height_m**2
+    per_sample_px = view.camera.fy_px * view.camera.height_m * sample_m / distance2_m2 / 1.5
     patterns, used = np.stack([_pattern(code, grid.samples) for code in codes], axis=1), _used(geometry.n, grid.samples)
     turns = [(about.turn_rad + turn, about.stretch * stretch) for turn in grid.turns for stretch in grid.stretches]
     places = [_Place(about.middle_m, turn_rad, stretch) for turn_rad, stretch in turns]

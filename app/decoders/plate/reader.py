@@ -139,9 +139,9 @@ def _read_registered(
     image: Frame, camera: Camera, codebook: Sequence[PlateCode], geometries: Sequence[PlateGeometry]
 ) -> PlateReading | None:
     """A plate whose colours do not show, where its units are those of a registered one."""
-    for geometry, likely in find_registered(image, camera, codebook, geometries):
+    for likely in find_registered(image, camera, codebook, geometries):
         missing = PlateOutcome.UNSURE, "found by a pattern of the registry"
-        read = read_pattern(image, likely.corners_px, geometry, codebook, missing, likely.tries)
+        read = read_pattern(image, likely.corners_px, likely.geometry, codebook, missing, likely.tries)
         if read is not None and read[0].code is not None:
             return with_pose(read[0], camera)
     return None
