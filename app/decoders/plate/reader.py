@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.confirm import UnitVerification, with_expected
-from app.decoders.plate.decode_symbols import DecodedSymbols
+from app.decoders.plate.decode_symbols import RIVAL_CELLS, DecodedSymbols
 from app.decoders.plate.detect_blobs import MarkerSignal, half_planes
 from app.decoders.plate.detect_quads import MarkerQuad
 from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, find_warm_plates
@@ -142,9 +142,19 @@ def _read_registered(
     for likely in find_registered(image, camera, codebook, geometries):
         missing = PlateOutcome.UNSURE, "found by a pattern of the registry"
         read = read_pattern(image, likely.corners_px, likely.geometry, codebook, missing, likely.tries)
-        if read is not None and read[0].code is not None:
+        if read is not None and read[0].code is not None and _is_distinct(read[0].code, codebook):
             return with_pose(read[0], camera)
     return None
+
+
+def _is_distinct(code: PlateCode, codebook: Sequence[PlateCode]) -> bool:
+    """Whether what covers a unit cannot make a code of another registered one: by its checks, or by its digits."""
+    apart = (
+        sum(a != b for a, b in zip(code.symbols, other.symbols, strict=True))
+        for other in codebook
+        if other.n == code.n and other.digits != code.digits
+    )
+    return code.scheme.corrects or min(apart, default=0) >= RIVAL_CELLS
 
 
 def _check(image: Frame, camera: Camera | None, thermal: bool, geometries: Sequence[PlateGeometry]) -> None:

@@ -21,7 +21,7 @@ from app.decoders.plate.detect_quads import detect_marker_quads
 from app.decoders.plate.follow_plate import expect_plate, find_expected
 from app.decoders.plate.reader import decode_plates, read_plates
 from app.decoders.plate.unit_likelihoods import RISK_BESIDE_HIDDEN, with_hidden_markers
-from app.markers.plate import PlateCode
+from app.markers.plate import PlateCode, PlateScheme
 from app.markers.reading import Certainty, PlateOutcome, PlatePose, PlateReading, SymbolEvidence
 from app.simulation.plate_face import Face
 from app.simulation.plate_scene import PlacedFace, PlateScene
@@ -230,6 +230,14 @@ def test_it_is_not_taken_for_a_registered_neighbour_of_another_code() -> None:
     image = shoot(PlacedFace(grey_markers(), AHEAD_M)).image
     read = [one.digits for one in decode_plates(image, camera=CAMERA, codebook=NEIGHBOURS) if one.code is not None]
     assert read in ([], [CODE.digits]), "its own checks may confirm it"
+
+
+def test_plain_digits_are_not_read_by_a_pattern_beside_a_registered_plate_that_differs_in_one() -> None:
+    """Snow on two units makes the other plate's digits of it, and nothing but a check would show that."""
+    built, shown = (PlateCode(digits, PlateScheme.POSITION, 8) for digits in ("623453036139", "623413036139"))
+    image = shoot(PlacedFace(grey_markers(shown), AHEAD_M)).image
+    for codebook in ((built, shown), (shown,)):
+        assert not any(reading.code for reading in decode_plates(image, camera=CAMERA, codebook=codebook))
 
 
 def test_it_is_not_sought_where_nothing_is_registered_or_the_mount_is_unknown() -> None:
